@@ -367,7 +367,7 @@ def halves(
     from jaxphoto.io import read_block
     from jaxphoto.procedures.compare import camera_of
     from jaxphoto.procedures.compare import halves as compare_halves
-    from jaxphoto.report.stability import print_halves, write_halves
+    from jaxphoto.report.stability import halves_verdict, write_halves
     from jaxphoto.writing import check_folder
 
     check_folder(out, block)
@@ -387,7 +387,7 @@ def halves(
 
         write_halves(result, out, write_camera, record)
     warn_of_contradictions(result.adjusted, output)
-    print_halves(result, output.screen)
+    output.say(*halves_verdict(result))
     output.wrote(out, f"results in {out} (open report.html)")
 
 

@@ -387,7 +387,7 @@ def orient(
     from jaxphoto.io.text_files import read_json
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.orientation import orient
-    from jaxphoto.report.photographs import print_orientation, write_orientation
+    from jaxphoto.report.photographs import orientation_sentences, write_orientation
 
     check_block_target(out, *images)
     if len(images) == 1 and (images[0] / TOML).is_file():
@@ -447,7 +447,7 @@ def orient(
         f"{matched.n_gross} matches rejected before orientation (off the epipolar line, or in pairs with too few); "
         f"sigma factor of the others {matched.sigma_factor:.2g}"
     )
-    print_orientation(result.report, output.screen)
+    output.say(*orientation_sentences(result.report))
     output.wrote(out, f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR")
     output.add(**read_json(out / "orientation.json"))
     if not result.report.converged:

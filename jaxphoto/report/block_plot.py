@@ -18,6 +18,8 @@ if TYPE_CHECKING:
 
 # Maximum number of points and of image frames in the plot; of more, every n-th is drawn.
 _POINTS, _FRAMES = 20_000, 300
+# Length of a drawn image pyramid as a fraction of the extent.
+_PYRAMID = 0.06
 # Indices of image corners along the outline of an image pyramid, drawn as one line; None: projection centre.
 _OUTLINE = (0, 1, 2, 3, 0, None, 0, None, 1, None, 2, None, 3)
 _CORNERS = np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]]) / 2

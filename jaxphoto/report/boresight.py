@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 from rich.console import Console
-from rich.text import Text
 
 from jaxphoto.errors import InputError
 from jaxphoto.procedures.boresight import Step
@@ -20,6 +19,7 @@ from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, 
 from jaxphoto.report.plots import axes_or_new, label
 from jaxphoto.report.results import rounded, write_results, write_study
 from jaxphoto.report.tables import Tables
+from jaxphoto.report.terminal import print_lines
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.writing import whole_folder
 
@@ -145,9 +145,5 @@ def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, f
 
 def print_boresight(steps: Sequence[Step], console: Console) -> None:
     """Print the verdict and the findings of each step."""
-    colour = "green" if all(step.go_on for step in steps) else "red"
-    console.print(boresight_verdict(steps), style=colour, highlight=False, markup=False)
-    for step in steps:
-        console.print(Text.assemble((f"step {step.number}", "bold"), f": {step.title}"))
-        for finding in step.findings:
-            console.print(f"  - {finding}", highlight=False, markup=False)
+    console.print(boresight_verdict(steps), style="green" if all(step.go_on for step in steps) else "red")
+    print_lines((f"step {step.number}: {'; '.join((step.title, *step.findings))}" for step in steps), console)

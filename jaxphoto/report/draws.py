@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -16,33 +17,22 @@ from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations import AXES
 from jaxphoto.report.formatting import column_unit
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, page, provenance
-from jaxphoto.report.plots import axes_or_new, label, new_figure
+from jaxphoto.report.plots import axes_or_new, label
 from jaxphoto.report.results import assumed_pixels
 from jaxphoto.sensitivity import Draws
 from jaxphoto.writing import whole_file
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from jaxphoto.sensitivity.posterior import Posterior
 
-_PICTURES = {
-    "interior": (
-        "Estimates over the draws",
-        "Grey: histogram of the draws; red line: value without errors; blue line: predicted normal distribution.",
-    ),
-    "effects": (
-        "Effect of each error on each estimate",
-        "Effect of one sigma of each error (row) on each estimate (column), relative to its predicted sigma.",
-    ),
-}
 LONG = ("exterior.", "point.", "check.", f"{TrajectoryKnot.kind}.")
 """Column prefixes of images, points and trajectory knots; these quantities are written to files only."""
 EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_rad", "phi_rad", "kappa_rad")
 _QUANTILES = {"q025": 0.025, "q50": 0.5, "q975": 0.975}
-# Maximum number of histograms in a figure; maximum width of the figure (inches).
-_SHOWN, _WIDEST = 12, 10.5
+# Maximum number of histograms, and of errors in the figure of effects.
+_SHOWN, _ERRORS = 12, 60
 
 
 def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFrame:
@@ -92,49 +82,22 @@ def _in_radians(path: str) -> str:
     return f"{name}.{parameter}" if kind == "interior" else f"{kind}.{name}.{parameter}"
 
 
-class Moments(NamedTuple):
-    """Mean, standard deviation and quantiles of one column of the draws."""
-
-    mean: float
-    sd: float
-    quantiles: tuple[float, ...]
-
-
-def moments(values: np.ndarray) -> Moments:
-    """Compute the moments of one column of the draws; NaN for too few draws."""
-    values = np.asarray(values, float)
-    if not len(values):
-        return Moments(np.nan, np.nan, (np.nan,) * len(_QUANTILES))
-    sd = float(values.std(ddof=1)) if len(values) > 1 else np.nan
-    return Moments(float(values.mean()), sd, tuple(np.quantile(values, list(_QUANTILES.values()))))
-
-
 def summary_table(
-    moments_of: Mapping[str, Moments],
+    columns: pd.DataFrame,
     nominal: Mapping[str, float],
     predicted: Mapping[str, float],
     cameras: Mapping[str, InteriorOrientation],
 ) -> pd.DataFrame:
-    """Tabulate the moments of the draws and their prediction.
+    """Tabulate the moments of the columns of draws and their prediction.
 
     Columns: quantity, nominal, mean, sd, quantiles, predicted_sigma, ratio (sd over predicted), unit.
     """
-    rows = [(name, nominal.get(name, np.nan), m.mean, m.sd, *m.quantiles) for name, m in moments_of.items()]
-    table = pd.DataFrame(rows, columns=["quantity", "nominal", "mean", "sd", *_QUANTILES])
-    table["predicted_sigma"] = [predicted.get(name, np.nan) for name in moments_of]
+    quantiles = columns.quantile(list(_QUANTILES.values())).set_axis(list(_QUANTILES)).T
+    table = pd.DataFrame({"mean": columns.mean(), "sd": columns.std()}).join(quantiles).reset_index(names="quantity")
+    table.insert(1, "nominal", table["quantity"].map(lambda name: nominal.get(name, np.nan)))
+    table["predicted_sigma"] = table["quantity"].map(lambda name: predicted.get(name, np.nan))
     table["ratio"] = table["sd"] / table["predicted_sigma"]
-    return table.assign(unit=[column_unit(name, cameras) for name in moments_of])
-
-
-def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Figure:
-    """Draw histograms of some columns, with the nominal value and the predicted normal density."""
-    chosen = list(columns)[:_SHOWN]
-    across = min(3, len(chosen))
-    figure = new_figure(3.3 * across, 2.5 * -(-len(chosen) // across))
-    for k, name in enumerate(chosen):
-        panel = figure.add_subplot(-(-len(chosen) // across), across, k + 1)
-        plot_draws(pd.DataFrame({name: columns[name]}), summary, name, panel)
-    return figure
+    return table.assign(unit=[column_unit(name, cameras) for name in table["quantity"]])
 
 
 def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Axes | None = None) -> Axes:
@@ -148,23 +111,19 @@ def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Ax
         names = ", ".join(name for name in quantities if name in draws and not name.startswith(LONG))
         raise InputError(f"unknown quantity {quantity!r} of the draws; use one of {names}, or one of images or points")
     ax, of = axes_or_new(ax), summary.set_index("quantity").loc[quantity]
-    _draw_histogram(ax, quantity, draws[quantity].to_numpy(float), float(of["nominal"]), float(of["predicted_sigma"]))
-    return ax
-
-
-def _draw_histogram(axes: Axes, name: str, values: np.ndarray, nominal: float, sigma: float) -> None:
+    values, nominal, sigma = draws[quantity].to_numpy(float), float(of["nominal"]), float(of["predicted_sigma"])
     # Skip the histogram if draws differ only by rounding.
     if len(values) and np.ptp(values) > 1e-12 * np.abs(values).max(initial=1e-300):
-        axes.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
-    axes.axvline(nominal, color="tab:red", lw=1)
+        ax.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
+    ax.axvline(nominal, color="tab:red", lw=1)
     if sigma > 0:
         at = np.linspace(-4, 4, 200)
-        density = np.exp(-0.5 * at**2) / sigma / np.sqrt(2 * np.pi)
-        axes.plot(nominal + sigma * at, density, color="tab:blue", lw=1)
-    axes.set_title(label(name), fontsize=9)
-    axes.set_yticks([])
-    axes.tick_params(labelsize=7)
-    axes.locator_params(axis="x", nbins=4)
+        ax.plot(nominal + sigma * at, np.exp(-0.5 * at**2) / sigma / np.sqrt(2 * np.pi), color="tab:blue", lw=1)
+    ax.set_title(label(quantity), fontsize=9)
+    ax.set_yticks([])
+    ax.tick_params(labelsize=7)
+    ax.locator_params(axis="x", nbins=4)
+    return ax
 
 
 def plot_effects(
@@ -188,13 +147,6 @@ def plot_effects(
     return ax
 
 
-def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: list[str]) -> Figure:
-    """Draw `plot_effects` in a figure of suitable size."""
-    figure = new_figure(min(1.8 + 0.8 * len(quantities), _WIDEST), max(3.2, 1.8 + 0.26 * len(effects)))
-    plot_effects(effects, summary, quantities, figure.subplots())
-    return figure
-
-
 def write_draws_page(
     summary: Mapping[str, Any],
     table: pd.DataFrame,
@@ -202,19 +154,27 @@ def write_draws_page(
     directory: Path,
     record: CommandRecord,
 ) -> None:
-    """Write report.html of the draws into `directory`: summary, its table, and the plots in the folder."""
+    """Write report.html of the draws in `directory`: summary, its table, histograms and effects."""
     few = ~table["quantity"].str.startswith(LONG)
     ratio = table.loc[few, "ratio"].dropna()
     ratios = "No estimate is predicted to change."
     if len(ratio):
         ratios = f"Standard deviations are {ratio.min():.3g} to {ratio.max():.3g} times the first-order prediction."
     verdict = f"{summary['draws']} draws, {summary['converged']} converged. {ratios}"
-    parts: list[Part] = [*assumed_pixels(sensors)]
-    for name, (heading, words) in _PICTURES.items():
-        if (file := directory / f"{name}.png").is_file():
-            parts += [Heading(heading), Paragraph(words), Plot(file, f"{heading}: {words}")]
     # List the errors last: their distribution is known.
     ordered = table[few].sort_values("quantity", key=lambda name: name.str.startswith("bias."), kind="stable")
+    shared = [name for name in ordered["quantity"] if not name.startswith("bias.")]
+    draws = pd.read_parquet(directory / "draws.parquet", columns=["converged", *shared[:_SHOWN]])
+    plots: list[Plot] = [
+        Plot(partial(plot_draws, draws[draws["converged"]], table, name), f"histogram of {name}", 2.6)
+        for name in shared[:_SHOWN]
+    ]
+    words = "Grey: histogram of the draws; red line: value without errors; blue line: predicted normal distribution."
+    parts: list[Part] = [*assumed_pixels(sensors), Heading("Estimates over the draws"), Paragraph(words), plots]
+    if (file := directory / "effects.csv").is_file() and len(effects := pd.read_csv(file)) <= _ERRORS:
+        words = "Effect of one sigma of each error (row) on each estimate (column), relative to its predicted sigma."
+        draw = partial(plot_effects, effects, table, [name for name in shared if name in effects])
+        parts += [Heading("Effect of each error on each estimate"), Plot(draw, words, max(3.2, 1 + 0.2 * len(effects)))]
     parts += [Heading("Means and standard deviations"), ordered]
     if not few.all():
         parts.append(Paragraph("Images, points and trajectory knots are in summary.csv."))
@@ -247,28 +207,6 @@ def posterior_table(posterior: Posterior) -> pd.DataFrame:
             "ess": posterior.ess,
         }
     )  # fmt: skip
-
-
-def posterior_figure(posterior: Posterior) -> Figure:
-    """Draw the sample of each parameter with its Gaussian, and the pair that deviates most from its 95 % ellipse."""
-    names, factor = _names_and_factors(posterior)
-    k = len(names)
-    figure = new_figure(2.6 * min(k + 1, 4), 2.6 * -(-(k + 1) // 4))
-    panels = [figure.add_subplot(-(-(k + 1) // 4), min(k + 1, 4), 1 + n) for n in range(k + (k > 1))]
-    draws, optimum = posterior.draws * factor, posterior.optimum * factor
-    laplace = posterior.laplace * np.outer(factor, factor)
-    for j, name in enumerate(names):
-        _draw_histogram(panels[j], name, draws[:, j], optimum[j], float(np.sqrt(laplace[j, j])))
-    if k > 1:
-        pair = list(np.unravel_index(np.argmax(posterior.outside), posterior.outside.shape))
-        turn = np.linspace(0, 2 * np.pi, 200)
-        circle = np.sqrt(-2 * np.log(0.05)) * np.stack([np.cos(turn), np.sin(turn)])
-        panels[k].plot(*draws[:, pair].T, ".", ms=1.5, color="tab:blue", alpha=0.4)
-        ellipse = np.linalg.cholesky(laplace[np.ix_(pair, pair)]) @ circle
-        panels[k].plot(*(optimum[pair][:, None] + ellipse), color="tab:red", lw=1.2)
-        panels[k].set(xlabel=label(names[pair[0]]), ylabel=label(names[pair[1]]))
-        panels[k].set_title(f"{100 * posterior.outside[tuple(pair)]:.0f} % outside, not 5 %", fontsize=8)
-    return figure
 
 
 def _names_and_factors(posterior: Posterior) -> tuple[list[str], np.ndarray]:

@@ -198,7 +198,10 @@ def _sigmas_of(table: pd.DataFrame, name: str) -> pd.Series | None:
 
 
 def _word(value: object) -> str:
-    return {True: "yes", False: "no"}[bool(value)] if isinstance(value, bool | np.bool_) else str(value)
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    # Markup, a kind of str, stays unescaped.
+    return value if isinstance(value, str) else str(value)
 
 
 def without_empty(table: pd.DataFrame) -> pd.DataFrame:

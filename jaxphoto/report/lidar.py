@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import InputError
@@ -24,7 +23,6 @@ from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, 
 from jaxphoto.report.plots import axes_or_new, title
 from jaxphoto.report.results import summary_of, write_results, write_study
 from jaxphoto.report.tables import Tables
-from jaxphoto.report.terminal import print_lines
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import angle_differences, correlation_matrix
 from jaxphoto.writing import whole_folder
@@ -229,43 +227,26 @@ def rounds_words(rounds: Sequence[Round], converged: bool) -> tuple[str, str]:
     )
 
 
-def print_rounds(rounds: Sequence[Round], converged: bool, console: Console) -> None:
-    """Print the outer iterations."""
-    print_lines(rounds_words(rounds, converged), console)
-
-
 def heights_page(control: LidarControl, record: CommandRecord) -> str:
-    """Return the page of cloud heights as control: iterations, flags, plot, and the largest differences."""
+    """Return the page of cloud heights as control: iterations, flags, plots, and the largest differences."""
     heights = heights_table(control)
     heights.insert(5, "difference_m", heights["height_m"] - heights["Z_m"])
     largest = heights.sort_values("difference_m", key=np.abs, ascending=False, kind="stable")[:_ROWS]
-    metres = largest.select_dtypes(float)
-    written = {str(name): metres[name].map("{:z.3f}".format).where(metres[name].notna(), "") for name in metres}
-    words = [*rounds_words(control.rounds, control.converged)]
-    words.append(f"{int(control.used.sum())} of {len(control.points)} tie points have a control height")
-    parts: list[Part] = [
-        *(Paragraph(as_sentence(sentence)) for sentence in words[1:]),
-        Heading("Over the ground"),
-        [
-            Plot(partial(plot_lidar_heights, control, residuals=r), words, 4)
-            for r, words in ((False, "heights of the cloud as control"), (True, "residuals of the control heights"))
-            if control.used.any() or not r
-        ],
-        Heading("Iterations"),
-        rounds_table(control.rounds).replace(np.inf, np.nan),
+    words = rounds_words(control.rounds, control.converged)
+    used = f"{int(control.used.sum())} of {len(control.points)} tie points have a control height"
+    plots = [
+        Plot(partial(plot_lidar_heights, control, residuals=r), name, 4)
+        for r, name in ((False, "heights of the cloud as control"), (True, "residuals of the control heights"))
+        if control.used.any() or not r
     ]
+    parts: list[Part] = [
+        *(Paragraph(as_sentence(text)) for text in (words[1], used)),
+        Heading("Over the ground"),
+        plots,
+    ]
+    parts += [Heading("Iterations"), rounds_table(control.rounds).replace(np.inf, np.nan)]
     if flags := flag_counts(control.flag):
         parts.append(pd.DataFrame({"flag": [name.lower() for name in flags], "heights": list(flags.values())}))
-    parts += [Heading("Largest differences"), without_empty(largest.assign(**written))]
+    parts += [Heading("Largest differences"), without_empty(largest.round(3))]
     parts += [Paragraph("All heights are in lidar_heights.csv."), *provenance(record)]
     return page(f"{control.block.title or 'Block'}: heights of a cloud as control", parts, (words[0], ""))
-
-
-def print_moved(result: Simultaneous, console: Console) -> None:
-    """Print every change, one per line."""
-    lines = []
-    for what, before, after, moved, sigma, unit in moved_table(result).itertuples(index=False):
-        range_words = f" from {before:.6g} to {after:.6g}" if np.isfinite(before) else ""
-        spread = f" (sigma {sigma:.2g})" if np.isfinite(sigma) else ""
-        lines.append(f"  {what}:{range_words} by {moved:.4g} {unit}{spread}".rstrip())
-    print_lines(lines, console)

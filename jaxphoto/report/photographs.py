@@ -68,11 +68,6 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
     return sentences + list(report.observed)
 
 
-def print_orientation(report: OrientationReport, console: Console) -> None:
-    """Print `orientation_sentences`."""
-    print_lines(orientation_sentences(report), console)
-
-
 def write_orientation(oriented: Oriented, folder: Path, **matching: float) -> None:
     """Write orientation.json, with statistics of the `matching`, into the folder of the block."""
     report = oriented.report

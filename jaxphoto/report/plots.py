@@ -328,16 +328,6 @@ def correlation_figure(tables: Tables, camera: str | None = None) -> Figure:
     return figure
 
 
-# Minimum number of contours; candidate contour levels (times powers of ten), of which the first set with enough
-# contours is used.
-_LINES = 5
-_ROUND = (
-    (1.0, 2.0, 5.0),
-    (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0),
-    (*np.arange(1.0, 2.0, 0.1), *np.arange(2.0, 5.0, 0.2), *np.arange(5.0, 10.0, 0.5)),
-)
-
-
 def plot_sigma_map(
     tables: Tables, camera: str | None = None, ax: Axes | None = None, *, distance_m: float = float("inf")
 ) -> Axes:
@@ -348,21 +338,10 @@ def plot_sigma_map(
 
 
 def draw_sigma_map(axes: Axes, sensor: Sensor, one: SigmaMap) -> None:
-    """Draw the standard deviation in the worst direction (px), with contours at round values."""
-    x, y = (np.unique(v) for v in one.points.T)
-    if len(x) * len(y) != len(one.points):
-        raise ValueError("the points of a map must form a grid of rows and columns")
-    worst = np.ma.masked_invalid(one.worst.reshape(len(y), len(x)) / sensor.pixel_mm)
-    levels = _levels(worst.compressed())
-    if levels:
-        filled = axes.contourf(x, y, worst, levels=levels, cmap="cividis", norm="log")
-        lines = axes.contour(x, y, worst, levels=levels, colors="white", linewidths=0.7)
-        axes.clabel(lines, fmt="%g", fontsize=8)
-        bar = axes.figure.colorbar(filled, ax=axes, shrink=0.9, ticks=levels, format="%g")
-        bar.ax.minorticks_off()
-        bar.set_label("worst direction [px]")
-    draw_format(axes, sensor)
-    title(axes, f"sigma {distance_words(one.distance_m)}")
+    """Draw the standard deviation in the worst direction (px)."""
+    known = np.isfinite(one.worst)
+    name = f"sigma {distance_words(one.distance_m)}, worst direction [px]"
+    draw_format_map(axes, sensor, one.points[known], name, one.worst[known] / sensor.pixel_mm)
 
 
 def distance_words(distance_m: float) -> str:
@@ -370,19 +349,6 @@ def distance_words(distance_m: float) -> str:
     if np.isinf(distance_m):
         return "of a point at infinity"
     return f"of a point at {distance_m:.0f} m" if distance_m >= 100 else f"of a point at {distance_m:.3g} m"
-
-
-def _levels(values: np.ndarray) -> list[float]:
-    """Choose round contour levels that enclose all values, in nearly constant ratio."""
-    values = values[values > 0]
-    if not len(values):
-        return []
-    low, high = values.min(), values.max()
-    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-    rounds = (np.round(np.outer(powers, steps).ravel(), 12) for steps in _ROUND)
-    inside = next((r for r in rounds if ((low < r) & (r < high)).sum() >= _LINES), np.array([low, high]))
-    first, last = np.searchsorted(inside, low, "right") - 1, np.searchsorted(inside, high, "left")
-    return [float(k) for k in inside[max(first, 0) : last + 1]]
 
 
 def distortion_of(tables: Tables, camera: str | None = None) -> DistortionCurve:

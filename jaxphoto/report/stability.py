@@ -87,16 +87,13 @@ def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_
 def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: float) -> pd.DataFrame:
     """Transpose the stability table to one column per method, in micrometres."""
     table = stability_table(analyses, pixel_mm, noise_mm).set_index("method")
-    um = {"RMSE_offset": "rmse_offset_mm", "as measured": "rmse_measured_mm", "largest": "largest_mm"}
-    with_sigma = "sigma_mm" in table
-    um |= (
-        {"sigma": "sigma_mm", "95 % from": "low_mm", "95 % to": "high_mm", "one camera": "expected_of_one_mm"}
-        if with_sigma
-        else {}
-    )
-    rows = {f"{name} [um]": (1e3 * table[column]).map("{:.4g}".format) for name, column in um.items()}
+    um = {
+        "RMSE_offset": "rmse_offset_mm", "as measured": "rmse_measured_mm", "largest": "largest_mm",
+        "sigma": "sigma_mm", "95 % from": "low_mm", "95 % to": "high_mm", "one camera": "expected_of_one_mm",
+    }  # fmt: skip
+    rows = {f"{name} [um]": (1e3 * table[c]).map("{:.4g}".format) for name, c in um.items() if c in table}
     rows["in pixels"] = table["rmse_offset_px"].map("{:.4g}".format)
-    rows |= {"p": table["p_value"].map("{:.2g}".format)} if with_sigma else {}
+    rows |= {"p": table["p_value"].map("{:.2g}".format)} if "p_value" in table else {}
     return pd.DataFrame(rows).T.reset_index(names="quantity")
 
 
@@ -362,11 +359,6 @@ def plot_halves(halves: Halves, ax: Axes | None = None, *, band: bool = False) -
     values = halves.band.calibration if band else halves.band.cell_factor
     draw_format_map(ax, halves.adjusted.block.sensors[halves.camera], halves.cells_mm, name, values)
     return ax
-
-
-def print_halves(halves: Halves, console: Console) -> None:
-    """Print the result."""
-    print_lines(halves_verdict(halves), console)
 
 
 def write_halves(

@@ -17,11 +17,10 @@ from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.observations import AttitudeSteps, PositionSteps
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
-from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
 from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL, SurveyedGap
 from jaxphoto.report.draws import in_degrees
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
-from jaxphoto.report.formatting import label_unit, of_sigma, with_sigma
+from jaxphoto.report.formatting import label_unit, to_rich
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, verdict_parts
 from jaxphoto.report.plots import axes_or_new, draw_matrix, label, title
 from jaxphoto.report.results import write_results, write_study
@@ -35,7 +34,6 @@ from jaxphoto.writing import whole_folder
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-_OF_POINTS = (PHOTOGRAPHS, CONTROL, CHECK)
 # Ratio of gaps at surveyed points to their noise above which they are a warning; additional tolerance for few planes
 # (sigmas).
 _FAR, _BEYOND = 2.0, 3.0
@@ -140,18 +138,15 @@ def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """Assess a strip adjustment; `tables` contains its adjustment if it has images."""
     found = _sigma_naught(result) if tables is None else verdict_of(tables).findings
     warnings = (Finding("message", "warning", sentence) for sentence in result.warnings)
-    return Verdict.of((*_lookups(result), *_steps(result), *warnings, *_surveyed(result), *found))
+    return Verdict.of((*_steps(result), *warnings, *_surveyed(result), *found))
 
 
-def _lookups(result: StripAdjustment) -> Iterator[Finding]:
+def _steps(result: StripAdjustment) -> Iterator[Finding]:
+    """Report missing convergence, and trajectories whose corrections are far above their standard deviations."""
     if not result.converged:
         n, change = len(result.rounds), result.rounds[-1].largest_change
         hint = "Increase the maximum number of iterations"
         yield Finding("lookups_not_converged", "error", value=change, hint=hint, numbers={"n": n})
-
-
-def _steps(result: StripAdjustment) -> Iterator[Finding]:
-    """Report trajectories whose corrections are far above their standard deviations."""
     for steps, errors, unit in (
         (PositionSteps, result.errors.position, "m"),
         (AttitudeSteps, np.rad2deg(result.errors.attitude), "degrees"),
@@ -185,19 +180,14 @@ def _surveyed(result: StripAdjustment) -> Iterator[Finding]:
 def surveyed_summary(result: StripAdjustment) -> dict[str, dict[str, float]]:
     """Summarise control and check points over all strips: planes, RMS of their gaps (m) before and after, noise."""
     summary: dict[str, dict[str, float]] = {}
-    for what in (CONTROL, CHECK):
-        rows = [d for d in result.differences if d.one == what]
-        if rows:
-            now, then = ([getattr(d, name) for d in rows] for name in ("planes", "planes_before"))
-            counts = {"rms_before_m": then, "rms_m": now, "noise_m": now}
-            pooled = {name: _pooled([getattr(d, name) for d in rows], n) for name, n in counts.items()}
-            summary[what.replace(" ", "_")] = {"planes": sum(now), **pooled}
+    for what, rows in differences_table(result.differences).groupby("one"):
+        if what in (CONTROL, CHECK):
+            pooled = {
+                name: float(np.sqrt(np.nansum(rows[name] ** 2 * rows[n]) / max(rows[n].sum(), 1)))
+                for name, n in (("rms_before_m", "planes_before"), ("rms_m", "planes"), ("noise_m", "planes"))
+            }
+            summary[str(what).replace(" ", "_")] = {"planes": int(rows["planes"].sum()), **pooled}
     return summary
-
-
-def _pooled(rms: Sequence[float], counts: Sequence[int]) -> float:
-    """Return the RMS of several sets; NaN (empty set) is skipped."""
-    return float(np.sqrt(np.nansum(np.square(rms) * counts) / max(sum(counts), 1)))
 
 
 def _sigma_naught(result: StripAdjustment) -> Iterator[Finding]:
@@ -252,21 +242,15 @@ def plot_scanner_correlation(result: StripAdjustment, ax: Axes | None = None, *,
 
     Raises InputError if none of these are estimated.
     """
-    rho, scanner, others = _scanner_and_others(result)
-    columns = scanner if itself else others
+    rho = all_correlations(result)
+    labels = [name for name in rho.index if not name.startswith(TrajectoryKnot.kind)]
+    scanner = [name for name in labels if name.startswith("scanner")]
+    columns = scanner if itself else [name for name in labels if name not in scanner]
     if not scanner or not columns:
         raise InputError(f"no parameters of {'the scanner' if not scanner else 'cameras and mounts'} are estimated")
     ax, name = axes_or_new(ax), f"scanner with {'itself' if itself else 'camera and mount'}"
     draw_matrix(ax, rho.loc[scanner, columns].to_numpy(), _short(scanner), _short(columns), name)
     return ax
-
-
-def _scanner_and_others(result: StripAdjustment) -> tuple[pd.DataFrame, list[str], list[str]]:
-    """Return all correlations, the unknowns of the scanner, and the unknowns of cameras and mounts."""
-    rho = all_correlations(result)
-    labels = [name for name in rho.index if not name.startswith(TrajectoryKnot.kind)]
-    scanner = [name for name in labels if name.startswith("scanner")]
-    return rho, scanner, [name for name in labels if name not in scanner]
 
 
 def _short(labels: list[str]) -> list[str]:
@@ -375,13 +359,12 @@ def _sections(
         yield Paragraph(
             "Parameters with correlations near 1 or -1 are not separable. correlation.csv has all unknowns."
         )
-        _, _, others = _scanner_and_others(result)
         yield [
             Plot(
                 partial(plot_scanner_correlation, result, itself=itself), f"correlations of the scanner with {words}", 4
             )
             for itself, words in ((False, "camera and mount"), (True, "itself"))
-            if itself or others
+            if itself or result.before
         ]
     if result.trajectory is None:
         yield Heading("Shifts of the strips")
@@ -417,18 +400,9 @@ def print_strips(result: StripAdjustment, console: Console) -> None:
     end = f"{'' if result.converged else 'not '}converged after {last.number} iterations"
     ties = f" and {last.points} tie points on them" if last.points else ""
     ties += f" and {last.control} of control" if last.control else ""
-    lines = [f"{end}; {last.planes} planes{ties}, {last.left_out} rejected"]
-    for d in result.differences:
-        before = f"{d.rms_before_m:.3f} m" if np.isfinite(d.rms_before_m) else "unknown"
-        pair = f"{d.one} and strip {d.other}" if d.one in _OF_POINTS else f"strips {d.one} and {d.other}"
-        lines.append(
-            f"  {pair}: gap {before} before, {d.rms_m:.3f} m after (RMS of {d.planes} planes, noise {d.noise_m:.3f} m)"
-        )
+    print_lines([f"{end}; {last.planes} planes{ties}, {last.left_out} rejected"], console)
+    console.print(to_rich(_in_tenths_of_mm(differences_table(result.differences)), "gaps of strips"))
     if result.trajectory is None:
-        for one in trajectory_errors_table(result).to_dict("records"):
-            estimated = [(a, one[f"{a}_m"], one[f"sigma_{a}_m"]) for a in "XYZ" if one[f"sigma_{a}_m"] > 0]
-            shift = ", ".join(f"{a} {with_sigma(v, s)} m (sigma {of_sigma(s)})" for a, v, s in estimated)
-            lines.append(f"  strip {one['strip']}: {'shift ' + shift if shift else 'fixed'}")
-    for parameter, value, sigma in calibration_table(result)[["parameter", "value", "sigma"]].itertuples(index=False):
-        lines.append(f"  {parameter}: {with_sigma(value, sigma)} (sigma {of_sigma(sigma)})")
-    print_lines(lines, console)
+        console.print(to_rich(trajectory_errors_table(result)[_SHIFTS], "shifts of strips"))
+    if len(table := calibration_table(result)):
+        console.print(to_rich(table, "scanner and cameras"))

@@ -8,6 +8,7 @@ from rich.text import Text
 from jaxphoto.errors import counted, printable
 from jaxphoto.report.findings import MARKS, Verdict
 from jaxphoto.report.formatting import to_rich
+from jaxphoto.report.residual_findings import component_tables
 from jaxphoto.report.tables import Tables, check_spread, recovery_spread
 from jaxphoto.statistics import VarianceComponents
 
@@ -71,12 +72,8 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
 
 def print_components(components: VarianceComponents, console: Console) -> None:
     """Print the variance component of each group."""
-    c = components
-    console.print(f"variance components, adjusted with them ({counted(c.iterations, 'iteration')}):")
-    for k, label in enumerate(c.labels):
-        factor = f"standard deviations x {c.factor[k] ** 0.5:.3g}, variances x {c.factor[k]:.3g} +- {c.sigma[k]:.2g}"
-        size = f"({counted(c.observations[k], 'observation')}, redundancy {c.redundancy[k]:.1f})"
-        console.print(plain(f"  {label}: {factor if c.supported[k] else 'as stated'} {size}"), soft_wrap=True)
+    table = component_tables(components)["variance_components"].drop(columns="degrees_of_freedom")
+    console.print(to_rich(table, f"variance components ({counted(components.iterations, 'iteration')})"))
 
 
 def print_warning(warning: str, console: Console, **options) -> None:
