@@ -1,4 +1,4 @@
-"""Plots of a block before or after adjustment: in plan or 3-D by matplotlib, and an interactive 3-D view by plotly."""
+"""Plots of a block before or after adjustment, in plan or 3-D."""
 
 from __future__ import annotations
 

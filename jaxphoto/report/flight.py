@@ -121,7 +121,7 @@ def report_of(part: FlightPart) -> PartReport:
 def _findings(part: FlightPart) -> Iterator[Finding]:
     report = part.oriented.report
     if not report.converged:
-        yield Finding("orientation_not_converged", "error", hint="See the section on the orientation")
+        yield Finding("orientation_not_converged", "error")
     if part.why_no_shutter:
         yield Finding("message", "warning", part.why_no_shutter)
     if part.no_control:
@@ -136,8 +136,7 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
         used = part.placed.used
         yield Finding("positions_rejected", "warning", value=int((~used).sum()), numbers={"n": len(used)})
     if report.alike > CORRELATED:
-        hint = "Run jaxphoto halves on the block for a better factor"
-        yield Finding("correlated_residuals", "warning", value=report.alike, limit=CORRELATED, hint=hint)
+        yield Finding("correlated_residuals", "warning", value=report.alike, limit=CORRELATED)
 
 
 def _images(part: FlightPart) -> pd.DataFrame:
@@ -167,7 +166,7 @@ def flight_verdict(flight: CalibratedFlight, reports: Sequence[PartReport], spoi
         found.append(Finding("several_parts", "warning", ", ".join(map(str, sizes)), len(sizes)))
     if unused:
         numbers = {"n": sum(sizes) + unused}
-        found.append(Finding("unused_images", "warning", value=unused, hint="See their table", numbers=numbers))
+        found.append(Finding("unused_images", "warning", value=unused, numbers=numbers))
     return Verdict.of(found)
 
 

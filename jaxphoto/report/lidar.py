@@ -71,25 +71,21 @@ def moved_table(result: Simultaneous) -> pd.DataFrame:
     rotations, object points and laser points, and the RMS height of points above the surface.
     """
     after, before = result.adjusted, result.before
-    sigma = np.asarray(Tables(after).covariance.shared_sigma)
     # Only scanner parameters have no value before the adjustment; use zero.
     then, now = (dict(zip(a.parameters, np.asarray(a.values.shared).tolist(), strict=True)) for a in (before, after))
     rows: list[tuple] = []
-    for path, s in zip(after.structure.labels, sigma, strict=True):
-        name = path.replace("_rad", "_deg")
-        factor, old, value = 180 / np.pi if path.endswith("_rad") else 1.0, then.get(path, 0.0), now[path]
-        moved = factor * (value - old)
-        rows.append((name, factor * old, factor * value, moved, factor * float(s), without_unit(name)[1]))
-    position, points = (
-        np.asarray(getter(after)) - np.asarray(getter(before))
-        for getter in (lambda a: a.unknowns.exterior.position, lambda a: a.unknowns.points)
-    )
-    moves = {f"camera stations, {axis}": (position[:, k], "m") for k, axis in enumerate(AXES)}
+    for path, s in zip(after.structure.labels, np.asarray(Tables(after).covariance.shared_sigma), strict=True):
+        name, factor = path.replace("_rad", "_deg"), 180 / np.pi if path.endswith("_rad") else 1.0
+        old, new = factor * then.get(path, 0.0), factor * now[path]
+        rows.append((name, old, new, new - old, factor * float(s), without_unit(name)[1]))
+    exterior = np.asarray(after.unknowns.exterior.position) - np.asarray(before.unknowns.exterior.position)
+    points = np.asarray(after.unknowns.points) - np.asarray(before.unknowns.points)
     angles = np.rad2deg(angle_differences(after, before)[1])
-    moves |= {f"images, {name}": (angles[:, k], "deg") for k, name in enumerate(("omega", "phi", "kappa"))}
-    moves |= {f"object points, {axis}": (points[:, k], "m") for k, axis in enumerate(AXES)}
-    moves |= {f"laser points, {axis}": (result.moved_cloud[k : k + 1], "m") for k, axis in enumerate(AXES)}
-    rows += [(what, np.nan, np.nan, _rms(values), np.nan, unit) for what, (values, unit) in moves.items()]
+    for what, names, values, unit in (
+        ("camera stations", AXES, exterior, "m"), ("images", ("omega", "phi", "kappa"), angles, "deg"),
+        ("object points", AXES, points, "m"), ("laser points", AXES, np.atleast_2d(result.moved_cloud), "m"),
+    ):  # fmt: skip
+        rows += [(f"{what}, {n}", np.nan, np.nan, _rms(values[:, k]), np.nan, unit) for k, n in enumerate(names)]
     both = [_rms(v) for v in (result.apart_before, result.apart)]
     rows.append(("points above the surface, RMSE", *both, both[1] - both[0], np.nan, "m"))
     return pd.DataFrame(rows, columns=["what", "before", "after", "moved", "sigma", "unit"])
@@ -132,19 +128,18 @@ def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residua
     points, used = np.asarray(control.adjusted.unknowns.points)[control.points], control.used
     if residuals and not used.any():
         raise InputError("no height of the cloud is used as control: no residuals to draw")
-    ax = axes_or_new(ax)
+    ax, missing = axes_or_new(ax), ~np.isfinite(control.height)
     if residuals:
-        difference = (control.height - points[:, 2])[used]
-        name = f"cloud minus adjusted: RMSE {_rms(difference):.3f} m"
-        _draw_heights(ax, points[used], difference, difference, "cloud minus adjusted height [m]", name)
+        v = (control.height - points[:, 2])[used]
+        name = f"cloud minus adjusted: RMSE {_rms(v):.3f} m"
+        _draw_heights(ax, points[used], v, v, "cloud minus adjusted height [m]", name)
         return ax
-    missing = ~np.isfinite(control.height)
     sets = ((missing, "no height", "0.6", "+"), (used, "control", "tab:blue", "o"))
     for chosen, words, colour, marker in (*sets, (~used & ~missing, "rejected", "#D55E00", "x")):
         ax.plot(*points[chosen, :2].T, marker, ms=5, color=colour, ls="none", label=f"{words} ({chosen.sum()})")
     ax.legend(loc="best", fontsize=8)
+    ax.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
     title(ax, "heights of the cloud")
-    _ground(ax)
     return ax
 
 
@@ -154,14 +149,9 @@ def _draw_heights(axes: Axes, points: np.ndarray, values: np.ndarray, scale: np.
     colours: dict[str, Any] = {"c": values, "cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     shown = axes.scatter(points[:, 0], points[:, 1], s=18, edgecolor="0.6", **colours)
     axes.figure.colorbar(shown, ax=axes, label=words, shrink=0.8)
-    title(axes, name)
-    _ground(axes)
-
-
-def _ground(axes: Axes) -> None:
     axes.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
     axes.ticklabel_format(useOffset=False, style="plain")
-    axes.locator_params(nbins=6)
+    title(axes, name)
 
 
 @contextmanager

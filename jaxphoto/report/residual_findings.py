@@ -15,7 +15,7 @@ from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import camera_words, few
 from jaxphoto.observations import PRIORS, Correlated
 from jaxphoto.procedures.adjust import ABSURD
-from jaxphoto.procedures.blunder_causes import InflatedComponent
+from jaxphoto.procedures.blunder_causes import InflatedComponent, coordinate_mistakes, is_mirrored
 from jaxphoto.procedures.snooping import SEVERAL, Snooped, mostly_rejected, rejected_images
 from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words, symbol
 from jaxphoto.report.formatting import in_file_unit
@@ -88,7 +88,7 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
     """Compare sigma naught with its expectation, and find the groups of observations that cause a deviation."""
     whole = statistics.global_test(tables.adjusted, tables.redundancy)
     if whole.redundancy <= 0:
-        yield Finding("no_redundancy", "warning", hint="Add observations")
+        yield Finding("no_redundancy", "warning")
         return
     tested = statistics.group_factors(tables.adjusted, tables.redundancy)
     factors = [f for f in tested if f.p_value < statistics.LEVEL / len(tested)]
@@ -98,12 +98,10 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
             p = {"p": p_words(f.p_value)}
             if not f.group.startswith(PRIORS):
                 factor, size = (1 / f.sigma, "large") if f.sigma < 1 else (f.sigma, "small")
-                hint = "Correct them (--weights estimates them)"
                 numbers = p | {"factor": factor, "size": size}
-                yield Finding("group_sigma", "warning", f.group.replace("_", " "), f.sigma, 1.0, hint, numbers)
+                yield Finding("group_sigma", "warning", f.group.replace("_", " "), f.sigma, 1.0, numbers=numbers)
             elif f.sigma < 1 and not (f.group == PRIORS and _priors_of_lens_type(tables.adjusted.block)):
-                hint = "If it was estimated from the same images, remove it: sigmas are too small"
-                yield Finding("prior_counted_twice", "warning", value=f.sigma, limit=1.0, hint=hint, numbers=p)
+                yield Finding("prior_counted_twice", "warning", value=f.sigma, limit=1.0, numbers=p)
         return
     groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.3g}" for f in factors)
     numbers = {"p": p_words(whole.p_value), "groups": f"; by group: {groups}" if groups else ""}
@@ -113,16 +111,11 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
         several = sum(n > 0 for n in tables.adjusted.n_observations.values()) > 1
         unit = whole.sigma < ANOTHER_UNIT and several
         code, severity = ("sigma0_unit", "error") if unit else ("sigma0_small", "warning")
-        hint = "Correct the standard deviations: unless all are too large by one factor, weights are wrong"
     elif whole.sigma <= NOTHING_FITS:
-        code, hint = "sigma0_large", "Standard deviations are too small, or there are blunders or an incomplete model"
+        code = "sigma0_large"
     else:
         code, severity = "sigma0_contradiction", "error"
-        hint = (
-            "Check approximate values, units, point ids and the largest residuals; jaxphoto adjust --snoop rejects "
-            "blunders"
-        )
-    yield Finding(code, severity, value=whole.factor**0.5, limit=whole.expected**0.5, hint=hint, numbers=numbers)
+    yield Finding(code, severity, value=whole.factor**0.5, limit=whole.expected**0.5, numbers=numbers)
 
 
 def stretch_findings(adjusted: Adjustment) -> Iterator[Finding]:
@@ -149,14 +142,13 @@ def _blunders(tables: Tables, suspects: Sequence[statistics.Suspect]) -> Iterato
             "effect": f"; it moves {symbol(name)} by {moved:.1g} sigma" if moved > _REPORTED else "",
         }  # fmt: skip
         severity: Severity = "error" if severe else "warning"
-        yield Finding("blunder", severity, s.words, factor * s.error, limit, "Check this observation", numbers)
+        yield Finding("blunder", severity, s.words, factor * s.error, limit, numbers=numbers)
     if explained := len(tables.blunders.suspects) - len(judged):
         yield Finding("explained_suspects", "note", value=explained, limit=limit)
     if len(judged) > _SHOWN:
         severity = "error" if any(severe for severe, *_ in judged) else "warning"
-        hint = "jaxphoto adjust --snoop rejects blunders"
         numbers = {"n": tables.blunders.n}
-        yield Finding("many_blunders", severity, value=len(judged), limit=limit, hint=hint, numbers=numbers)
+        yield Finding("many_blunders", severity, value=len(judged), limit=limit, numbers=numbers)
 
 
 def _effect(tables: Tables, suspect: statistics.Suspect) -> tuple[str, float]:
@@ -338,18 +330,21 @@ def _common(snooped: Snooped, block: Block) -> Iterator[Finding]:
                 factor, unit = in_file_unit(own[0].unit)
                 subject = f"{name.replace('_', ' ')}{f' in strip {strip}' if strip else ''} along {axis}"
                 numbers = {"n": len(own), "bias": factor * mean, "unit": unit}
-                hint = "Estimate it (such as a shift), or correct it at its source"
-                yield Finding("rejected_bias", "warning", subject, float(part.sum()), hint=hint, numbers=numbers)
+                yield Finding("rejected_bias", "warning", subject, float(part.sum()), numbers=numbers)
 
 
 def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
     """Find images and groups with too many rejections for isolated errors."""
-    hint = "Check its point names, axes and their signs, camera and station, or remove it"
-    if images := [f"{block.images[k]} ({n} of {of})" for k, (n, of) in rejected_images(snooped, block).items()]:
-        yield Finding("rejected_images", "error", few(images), len(images), hint=hint)
-    hint = "Check their units, axes, names and signs, and the fixed values"
+    most = rejected_images(snooped, block)
+    mirrored = "They fit mirrored: x and y are exchanged, or one has the wrong sign"
+    fits = {k: is_mirrored(snooped, block, k) for k in most}
+    for hint, which in ((mirrored, True), ("", False)):
+        if images := [f"{block.images[k]} ({n} of {of})" for k, (n, of) in most.items() if fits[k] is which]:
+            yield Finding("rejected_images", "error", few(images), len(images), hint=hint)
+    mistakes = coordinate_mistakes(snooped, block)
     for name, counts in mostly_rejected(snooped, block).items():
         many = ", ".join(f"{n} of {of} in {axis}" for axis, (n, of) in counts.items())
+        hint = f"They fit if {mistakes[name]}: correct them at their source" if name in mistakes else ""
         yield Finding("rejected_group", "error", f"{name.replace('_', ' ')}, {many}", hint=hint)
 
 
@@ -379,12 +374,10 @@ def component_findings(
     """Report components caused by blunders, missing convergence, and groups whose component is not estimable."""
     found = []
     for component in blunders:
-        hint = "Adjust with --snoop as well: blunders inflate variance components"
         numbers = {"words": few(list(component.words))}
         found.append(
-            Finding("component_blunder", "error", component.label, component.factor, component.without, hint, numbers)
+            Finding("component_blunder", "error", component.label, component.factor, component.without, numbers=numbers)
         )
     if not components.converged:
-        hint = "Estimate them for fewer groups"
-        found.append(Finding("components_not_converged", "warning", value=components.iterations, hint=hint))
+        found.append(Finding("components_not_converged", "warning", value=components.iterations))
     return found + [Finding("component", "warning", sentence) for sentence in components.warnings.values()]

@@ -274,18 +274,17 @@ def adjustment_sections(
 ) -> Iterator[Part]:
     """Yield all sections of an adjustment. `start`: initial camera; `factor`: factor of its standard deviations."""
     a, cameras = tables.adjusted, plotted_cameras(tables)
+    mapped = [camera for camera in tables.sigma_maps if camera in cameras]
     yield from _interior(tables, cameras, start, factor)
-    if mapped := [camera for camera in tables.sigma_maps if camera in cameras]:
+    if mapped:
         yield Heading("Distortion")
         yield Paragraph("Measured minus ideal image coordinates along the radius, for the adjusted c.")
         for camera in mapped:
             curve, words = plots.distortion_of(tables, camera), camera_words(camera)
+            draw, band = partial(plots.draw_distortion, curve=curve, factor=factor), plots.plot_distortion_band
             yield [
-                Plot(
-                    partial(plots.draw_distortion, curve=curve, factor=factor),
-                    f"distortion of {words} by distance",
-                ),
-                Plot(partial(plots.plot_distortion_band, tables, camera), f"95 % band for {words}"),
+                Plot(draw, f"distortion of {words} by distance"),
+                Plot(partial(band, tables, camera), f"95 % band for {words}"),
             ]
         yield Heading("Projection uncertainty over the image format")
         yield Paragraph(
@@ -293,22 +292,22 @@ def adjustment_sections(
             "(sigma_map.csv). At infinity the error in c propagates fully; at the object distance it is partly "
             "compensated by the camera position."
         )
-        for camera in mapped:
-            sensor = a.block.sensors[camera]
-            yield [Plot(partial(plots.draw_sigma_map, sensor=sensor, one=one), _map_words(sensor, one))
-                   for one in tables.sigma_maps[camera]]  # fmt: skip
+        for one in (one for camera in mapped for one in tables.sigma_maps[camera]):
+            sensor, worst = a.block.sensors[one.camera], one.worst[np.isfinite(one.worst)]
+            px = worst / sensor.pixel_mm
+            spread = f"median {np.median(px):.2g} px, worst {px.max():.2g} px" if len(px) else "unknown"
+            words = f"{camera_words(one.camera)}: sigma {plots.distance_words(one.distance_m)}, {spread}"
+            yield [Plot(partial(plots.draw_sigma_map, sensor=sensor, one=one), words)]
     if tables.truth:
-        recovery = tables.recovery
         yield Heading("Recovery of the true values")
         yield Paragraph(
             "Estimate minus truth in standard deviations (recovery.csv): an RMS of about 1, and 5 % beyond 2, if the "
             "model of the adjustment is that of the simulation."
         )
-        yield recovery_spread(recovery)
-        yield recovery[recovery["parameter"].str.startswith("interior[")]
+        yield recovery_spread(tables.recovery)
+        yield tables.recovery[tables.recovery["parameter"].str.startswith("interior[")]
     if len(tables.georeferencing):
-        yield Heading("Mounts and strips")
-        yield tables.georeferencing
+        yield from (Heading("Mounts and strips"), tables.georeferencing)
     yield Heading("Block")
     yield [Plot(partial(plot_block, a), block_words(a.block), 4.2)]
     yield from _residuals(tables, cameras)
@@ -317,7 +316,15 @@ def adjustment_sections(
     yield Heading("Exterior orientation")
     yield [Plot(partial(plots.plot_error_ellipses, tables, unit=unit), "error ellipses of projection centres", 4)]
     yield tables.exterior
-    yield from _correlations(tables)
+    if len(summary := tables.correlation_summary):
+        yield Heading("Correlation of exterior and interior orientation over the images")
+        yield Paragraph("The largest absolute correlation over the images; means are in correlation_summary.csv.")
+        yield side_by_side(summary, ["camera", "exterior"], "interior", "max_abs_rho")
+    ground = tables.correlation_ground
+    if len(ground := ground[ground["sigma_m"] > 0]):
+        yield Heading("Correlation of the interior orientation and the ground as a whole")
+        ground = ground.assign(ground=ground["ground"].str.replace("_", " "))
+        yield side_by_side(ground, ["camera", "ground", "sigma_m"], "parameter", "rho")
     if len(tables.convergence):
         yield Heading("Convergence")
         yield Paragraph(convergence_words(a))
@@ -327,11 +334,10 @@ def adjustment_sections(
 
 def plotted_cameras(tables: Tables) -> list[str]:
     """Return the cameras to plot; of many, those with the most image points."""
-    block, structure = tables.adjusted.block, tables.adjusted.structure
-    cameras, of_image = list(tables.adjusted.unknowns.interior), np.array(block.image_camera)
-    n_points = np.bincount(structure.image, minlength=len(of_image))
-    most = sorted(cameras, key=lambda camera: -int(n_points[of_image == camera].sum()))[:_PLOTTED]
-    return [camera for camera in cameras if camera in most]
+    of_image = pd.Series(tables.adjusted.block.image_camera)
+    most = of_image.iloc[tables.adjusted.structure.image].value_counts().index[:_PLOTTED]
+    cameras = list(tables.adjusted.unknowns.interior)
+    return [camera for camera in cameras if len(cameras) <= _PLOTTED or camera in most]
 
 
 def interior_table(tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0) -> pd.DataFrame:
@@ -340,76 +346,60 @@ def interior_table(tables: Tables, start: InteriorOrientation | None = None, fac
     rows = []
     for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
         name, pixel, estimated = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma"] > 0
-        in_px = (
-            plus_minus(p["value"] / pixel, p["sigma_correlated"] / pixel) if estimated and name.endswith("_mm") else ""
-        )
+        correlated, in_mm = p["sigma_correlated"], estimated and name.endswith("_mm")
         rows.append({
             "camera": p["camera"], "parameter": name,
             "initial": f"{float(get_parameter(start, name)):.6g}" if start and name in parameter_names(start) else "",
             "value": with_sigma(p["value"], p["sigma"]), "sigma": of_sigma(p["sigma"]) if estimated else "fixed",
-            "sigma (correlated residuals)": of_sigma(p["sigma_correlated"]) if estimated and factor > 1 else "",
-            "unit": p["unit"], "in pixels": in_px, "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
+            "sigma (correlated residuals)": of_sigma(correlated) if estimated and factor > 1 else "",
+            "unit": p["unit"], "in pixels": plus_minus(p["value"] / pixel, correlated / pixel) if in_mm else "",
+            "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
         })  # fmt: skip
-    shown = pd.DataFrame(rows)
-    several = len(tables.adjusted.unknowns.interior) > 1
-    return shown.drop(columns=[c for c in shown if not shown[c].any() or (c == "camera" and not several)])
+    shown = without_empty(pd.DataFrame(rows))
+    return shown if len(tables.adjusted.unknowns.interior) > 1 else shown.drop(columns="camera")
 
 
 def _interior(
     tables: Tables, cameras: Sequence[str], start: InteriorOrientation | None, factor: float
 ) -> Iterator[Part]:
-    block = tables.adjusted.block
     yield Heading("Interior orientation")
     yield interior_table(tables, start, factor)
     yield Paragraph(
         "Lengths in mm, x to the right and y up from the centre of the format. Standard deviations are a posteriori "
         f"(times sigma naught); correlations refer to the rotations {tables.rotations.replace('_', ', ')}."
     )
-    yield from assumed_pixels(block.sensors)
+    yield from assumed_pixels(tables.adjusted.block.sensors)
     for camera in cameras:
-        reached = format_coverage(tables.adjusted, camera)
+        reached, words = format_coverage(tables.adjusted, camera), camera_words(camera)
         yield Paragraph(
-            f"Image points of {camera_words(camera)} cover {100 * reached.whole:.0f} % of the format, those of an "
-            f"image {100 * np.median(reached.images):.0f} % (median; minimum {100 * reached.images.min():.0f} %): "
-            "beyond, the distortion is extrapolated."
+            f"Image points of {words} cover {100 * reached.whole:.0f} % of the format, those of an image "
+            f"{100 * np.median(reached.images):.0f} % (median; minimum {100 * reached.images.min():.0f} %): beyond, "
+            "the distortion is extrapolated."
             if len(reached.images)
-            else f"{camera_words(camera)} has no image points."
+            else f"{words} has no image points."
         )
     if (n := len(tables.adjusted.unknowns.interior)) > len(cameras):
         some = ", ".join(cameras)
         yield Paragraph(f"Plots show {len(cameras)} of {n} cameras, those with the most image points: {some}.")
     for camera, c in tables.correlations.items():
         if camera in cameras and c.parameters:
-            matrices = [("correlation of IOP", c.interior, c.parameters)]
-            matrices += [("mean |correlation| of EOP and IOP", c.mean_abs, c.eop_names)] if c.images else []
-            yield [
-                Plot(partial(plots.draw_matrix, values=v, rows=rows, columns=c.parameters, name=name), name, 3.8)
-                for name, v, rows in matrices
-            ]
-
-
-def _map_words(sensor: Sensor, one) -> str:
-    worst = one.worst[np.isfinite(one.worst)] / sensor.pixel_mm
-    spread = f"median {np.median(worst):.2g} px, worst {worst.max():.2g} px" if len(worst) else "unknown"
-    return f"{camera_words(one.camera)}: sigma {plots.distance_words(one.distance_m)}, {spread}"
+            pair = (plots.plot_interior_correlation, plots.plot_exterior_correlation)[: 1 + bool(c.images)]
+            yield [Plot(partial(plot, tables, camera), f"correlations of {camera_words(camera)}", 3.8) for plot in pair]
 
 
 def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
-    a = tables.adjusted
     yield Heading("Residuals")
     yield tables.residual_spread
     for camera in cameras:
-        words = camera_words(camera)
-        panels = [
-            Plot(partial(plots.plot_residuals, tables, camera), f"image residuals of {words}", 3.8),
-            Plot(partial(plots.plot_mean_residuals, tables, camera), f"mean residuals of {words}", 3.8),
-            Plot(partial(plots.plot_density, tables, camera), f"image points of {words} by cell"),
-        ]
+        panels = {
+            "image residuals": plots.plot_residuals, "mean residuals by cell": plots.plot_mean_residuals,
+            "image points by cell": plots.plot_density,
+        }  # fmt: skip
         if camera in tables.sigma_maps:
-            by_radius = partial(plots.plot_residuals_by_radius, tables, camera)
-            panels.append(Plot(by_radius, f"residuals of {words} by distance from the principal point"))
-        yield panels
-    if len(a.block.stations.who):
+            panels["residuals by distance from the principal point"] = plots.plot_residuals_by_radius
+        words = camera_words(camera)
+        yield [Plot(partial(plot, tables, camera), f"{name}, {words}", 3.8) for name, plot in panels.items()]
+    if len(tables.adjusted.block.stations.who):
         yield [Plot(partial(plots.plot_station_residuals, tables), "residuals of stations in order of time")]
     if len(tables.trends):
         yield Paragraph("Systematic residuals, by image format, time and strip:")
@@ -466,18 +456,6 @@ def _check_points(tables: Tables) -> Iterator[Part]:
             for up in (False, True)
         ]  # fmt: skip
         yield tables.check_points
-
-
-def _correlations(tables: Tables) -> Iterator[Part]:
-    if len(summary := tables.correlation_summary):
-        yield Heading("Correlation of exterior and interior orientation over the images")
-        yield Paragraph("The largest absolute correlation over the images; means are in correlation_summary.csv.")
-        yield side_by_side(summary, ["camera", "exterior"], "interior", "max_abs_rho")
-    ground = tables.correlation_ground
-    if len(ground := ground[ground["sigma_m"] > 0]):
-        yield Heading("Correlation of the interior orientation and the ground as a whole")
-        ground = ground.assign(ground=ground["ground"].str.replace("_", " "))
-        yield side_by_side(ground, ["camera", "ground", "sigma_m"], "parameter", "rho")
 
 
 def convergence_words(adjusted: Adjustment) -> str:

@@ -226,15 +226,15 @@ def write_sensitivity(
 
 
 def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:
-    adjusted, largest, shares = tables.adjusted, tables.largest.set_index("estimate"), tables.variance_shares
+    adjusted, shares = tables.adjusted, tables.variance_shares.groupby("estimate")
     mdb = external_reliability(adjusted, tables.exact, tables.delta0).mdb
-    interior = {}
-    for name in (path for path in tables.exact.labels if path.startswith("interior")):
-        groups = shares[shares["estimate"] == name].set_index("group")["share"]
-        interior[name] = {
-            "largest_change": {key: largest.loc[name][key] for key in _LARGEST},
-            "variance_shares": {str(group): float(share) for group, share in groups.items()},
+    interior = {
+        row["estimate"]: {
+            "largest_change": {key: row[key] for key in _LARGEST},
+            "variance_shares": shares.get_group(row["estimate"]).set_index("group")["share"].to_dict(),
         }
+        for row in tables.largest.to_dict("records")
+    }
     return {
         "title": adjusted.block.title, "bias_m": tables.bias_m, "per": tables.per, "delta0": tables.delta0,
         "sigma0": float(adjusted.sigma0), "redundancy": adjusted.redundancy, "check_points": len(tables.check),

@@ -47,12 +47,11 @@ class Compared(NamedTuple):
 
 def about_sets(sets: tuple[Compared, Compared]) -> list[str]:
     """Describe both calibrations, the source of the uncertainty, and assumed pixel sizes."""
-    without = [one.name for one in sets if not one.known]
-    uncertainty = "Uncertainty from the covariances of both sets, assuming different images."
-    if len(without) == 1:
-        uncertainty = f"{without[0]} has no covariance and is assumed exact: the uncertainty is that of the other set."
-    elif without:
-        uncertainty = "Neither set has a covariance: no uncertainty is given."
+    uncertainty = (
+        "Neither set has a covariance: no uncertainty is given.",
+        "The set without covariance is assumed exact: the uncertainty is that of the other set.",
+        "Uncertainty from the covariances of both sets, assuming different images.",
+    )[sum(one.known for one in sets)]
     assumed = assumed_pixel_words({one.name: one.sensor for one in sets})
     return [str(sets[0]), str(sets[1]), uncertainty, *([assumed] if assumed else [])]
 
@@ -229,8 +228,7 @@ def change_headline(change: Change) -> str:
 
 def plot_change(change: Change, sensor: Sensor, ax: Axes | None = None, *, over_usual: bool = False) -> Axes:
     """Draw offsets of the rays of two calibrations over the format (px), or their ratio to the limit."""
-    ax = axes_or_new(ax)
-    name = f"offset over its {100 * LEVEL:.0f} % limit" if over_usual else "offset [px]"
+    ax, name = axes_or_new(ax), f"offset over its {100 * LEVEL:.0f} % limit" if over_usual else "offset [px]"
     values = change.offset_mm / (change.limit_mm if over_usual else sensor.pixel_mm)
     draw_format_map(ax, sensor, np.asarray(change.field.offsets.points), name, values)
     return ax
@@ -305,19 +303,15 @@ def cut_table(halves: Halves) -> pd.DataFrame:
     Columns: cut, factor, inside (fraction of cells within the band of the other splits), rms_px (of the difference over
     the format), sigma0_first, sigma0_second, problem, first (units of the first half).
     """
-    by, rows = halves.adjusted.block.owners(halves.by), []
+    by, rows, band = halves.adjusted.block.owners(halves.by), [], halves.band
     for k, cut in enumerate([*halves.cuts, *halves.failed]):
-        good = k < len(halves.cuts)
+        values, sigma0 = (np.nan,) * 3, cut.sigma0 or (np.nan, np.nan)
+        if k < len(halves.cuts):
+            values = band.of_cuts[k], band.inside[k], float(np.sqrt((cut.offsets_px**2).sum(axis=1).mean()))
         units = dict.fromkeys(unit for unit, first in zip(by, cut.first, strict=True) if first)
-        sigma0 = cut.sigma0 or (np.nan, np.nan)
-        rows.append({
-            "cut": k + 1,
-            "factor": halves.band.of_cuts[k] if good else np.nan,
-            "inside": halves.band.inside[k] if good else np.nan,
-            "rms_px": float(np.sqrt((cut.offsets_px**2).sum(axis=1).mean())) if good else np.nan,
-            "sigma0_first": sigma0[0], "sigma0_second": sigma0[1], "problem": cut.problem, "first": " ".join(units),
-        })  # fmt: skip
-    return pd.DataFrame(rows)
+        rows.append((k + 1, *values, *sigma0, cut.problem, " ".join(units)))
+    columns = ["cut", "factor", "inside", "rms_px", "sigma0_first", "sigma0_second", "problem", "first"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def halves_verdict(halves: Halves) -> list[str]:

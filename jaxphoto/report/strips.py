@@ -145,8 +145,7 @@ def _steps(result: StripAdjustment) -> Iterator[Finding]:
     """Report missing convergence, and trajectories whose corrections are far above their standard deviations."""
     if not result.converged:
         n, change = len(result.rounds), result.rounds[-1].largest_change
-        hint = "Increase the maximum number of iterations"
-        yield Finding("lookups_not_converged", "error", value=change, hint=hint, numbers={"n": n})
+        yield Finding("lookups_not_converged", "error", value=change, numbers={"n": n})
     for steps, errors, unit in (
         (PositionSteps, result.errors.position, "m"),
         (AttitudeSteps, np.rad2deg(result.errors.attitude), "degrees"),
@@ -155,11 +154,8 @@ def _steps(result: StripAdjustment) -> Iterator[Finding]:
         if over_sigma > _CONTRADICTS:
             largest = [np.abs(errors[s.first : s.first + s.size]).max() for s in result.errors.splines]
             k = int(np.argmax(largest))
-            hint = "Check the heights, coordinate system and trajectory of this strip"
             numbers = {"unit": unit, "change": over_sigma}
-            yield Finding(
-                "strip_contradiction", "error", result.cloud.strips[k], float(largest[k]), hint=hint, numbers=numbers
-            )
+            yield Finding("strip_contradiction", "error", result.cloud.strips[k], float(largest[k]), numbers=numbers)
 
 
 def _surveyed(result: StripAdjustment) -> Iterator[Finding]:
@@ -359,12 +355,13 @@ def _sections(
         yield Paragraph(
             "Parameters with correlations near 1 or -1 are not separable. correlation.csv has all unknowns."
         )
+        names = result.adjusted.structure.labels
         yield [
             Plot(
                 partial(plot_scanner_correlation, result, itself=itself), f"correlations of the scanner with {words}", 4
             )
             for itself, words in ((False, "camera and mount"), (True, "itself"))
-            if itself or result.before
+            if itself or not all(name.startswith(("scanner", TrajectoryKnot.kind)) for name in names)
         ]
     if result.trajectory is None:
         yield Heading("Shifts of the strips")

@@ -9,7 +9,6 @@ import jax
 import numpy as np
 
 from jaxphoto.adjustment import POOR, Adjustment, weaknesses_of, yardsticks
-from jaxphoto.block import Block
 from jaxphoto.camera import RollingShutter, Sensor, ThermalRates, get_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
@@ -76,7 +75,6 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     if adjusted.left_out:
         yield Finding("rejected", "warning", left_out_words(adjusted))
     yield from behind_findings(adjusted)
-    yield from duplicate_findings(adjusted.block)
     yield from residual_findings(tables)
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))
@@ -92,8 +90,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     yield from (_not_significant(tables, s) for s in tables.significance if not s.significant)
     for name, sensor in adjusted.block.sensors.items():
         if not _invertible(adjusted, name, sensor):
-            hint = "Estimate fewer coefficients or measure more points in the corners"
-            yield Finding("distortion_not_invertible", "warning", camera_words(name), hint=hint)
+            yield Finding("distortion_not_invertible", "warning", camera_words(name))
     yield from reliability_findings(tables)
     yield from stretch_findings(adjusted)
 
@@ -101,14 +98,13 @@ def _findings(tables: Tables) -> Iterator[Finding]:
 def _not_converged(adjusted: Adjustment) -> Iterator[Finding]:
     yield Finding("not_converged", "error", adjusted.outcome.value)
     if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.diverged_points)]:
-        yield Finding("diverged_points", "error", few(names), len(names), hint="Check their image measurements")
+        yield Finding("diverged_points", "error", few(names), len(names))
     sigma0 = float(adjusted.sigma0)
     # Good fit without convergence indicates an undetermined direction, not poor initial values.
     if sigma0 <= NOTHING_FITS:
         yield from (Finding("undetermined", "error", w.sentence) for w in weaknesses_of(adjusted))
     elif np.isfinite(sigma0):
-        hint = "Run jaxphoto adjust --snoop to find contradicting observations and mistakes in files"
-        yield Finding("nothing_fits", "error", value=sigma0, limit=NOTHING_FITS, hint=hint)
+        yield Finding("nothing_fits", "error", value=sigma0, limit=NOTHING_FITS)
 
 
 def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
@@ -117,43 +113,11 @@ def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
     rows, seen = block.image_points, in_front(block, adjusted.unknowns)
     away = looking_away(block, seen)
     if names := [block.images[k] for k in away]:
-        hint = (
-            "The image is mirrored: x and y of its image points are exchanged or one has the wrong sign; if all images "
-            "are affected, the vertical direction is wrong"
-        )
-        yield Finding("mirrored_image", "error", few(names), len(names), hint=hint)
+        yield Finding("mirrored_image", "error", few(names), len(names))
     behind = np.flatnonzero(~seen & ~np.isin(rows.image, away))
     if len(behind):
         names = [f"{block.points[rows.point[k]]} in {block.images[rows.image[k]]}" for k in behind]
-        hint = "Remove them: their rays are nearly parallel or wrong"
-        yield Finding("points_behind", "warning", few(names), len(names), hint=hint)
-
-
-def duplicate_images(block: Block) -> list[tuple[str, str, int]]:
-    """Return pairs of images with mostly equal image points (to a tenth of sigma), and the number of equal points."""
-    least_count, least_fraction, tolerance = 4, 0.5, 0.1
-    rows = block.image_points
-    x, y = np.asarray(rows.xy).T
-    order = np.lexsort([rows.image, y, x, rows.point])
-    near = tolerance * np.asarray(rows.sigma).min(axis=1)[order][1:]
-    point, image, x, y = (v[order] for v in (rows.point, rows.image, x, y))
-    equal = (point[1:] == point[:-1]) & (image[1:] != image[:-1]) & (np.diff(x) <= near) & (abs(np.diff(y)) <= near)
-    pairs, count = np.unique(np.sort(np.stack([image[1:], image[:-1]])[:, equal], axis=0), axis=1, return_counts=True)
-    n_points = np.bincount(rows.image, minlength=len(block.images))
-    enough = (count >= least_count) & (count > least_fraction * n_points[pairs].max(axis=0))
-    return [
-        (block.images[a], block.images[b], int(n)) for (a, b), n in zip(pairs.T[enough], count[enough], strict=True)
-    ]
-
-
-def duplicate_findings(block: Block) -> Iterator[Finding]:
-    """Report the first pair of duplicate images, and the number of further pairs."""
-    if pairs := duplicate_images(block):
-        one, other, n = pairs[0]
-        others = f"; {len(pairs) - 1} further pairs" if len(pairs) > 1 else ""
-        hint = "Delete one of each pair: standard deviations are too small if both are used"
-        subject = f"{one} and {other}"
-        yield Finding("duplicate_images", "warning", subject, n, hint=hint, numbers={"others": others})
+        yield Finding("points_behind", "warning", few(names), len(names))
 
 
 # Weak geometry ---------------------------------------------------------------------------------------------------
@@ -330,12 +294,10 @@ def ground_findings(tables: Tables) -> Iterator[Finding]:
                 sigma = tables.interior.set_index(["camera", "parameter"])["sigma"][camera, "c_mm"]
                 what = ("the height of the ground", "the distance of the images from the ground")[k]
                 numbers = {"what": what, "sigma": sigma, "effect": abs(rho[k]) * g.sigma_m[k]}
-                hint = "Known heights on the ground, another flying height or oblique images separate them"
-                yield Finding("ground_c", "note", words, float(rho[k]), HIGH_CORRELATION, hint, numbers)
+                yield Finding("ground_c", "note", words, float(rho[k]), HIGH_CORRELATION, numbers=numbers)
         if dome > HIGH_CORRELATION:
-            hint = "Control in the middle and at the edge, oblique images or cross strips separate them"
             numbers = {"effect": g.sigma_m[FORMS.index("dome")]}
-            yield Finding("ground_dome", "note", words, dome, HIGH_CORRELATION, hint, numbers)
+            yield Finding("ground_dome", "note", words, dome, HIGH_CORRELATION, numbers=numbers)
 
 
 def _invertible(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
@@ -367,8 +329,7 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
             continue
         known, words = float(prior.sigma), camera_words(camera)
         if sigma > little * known:
-            hint = "Another flying height, oblique images or known heights on the ground would determine it"
-            yield Finding("lens_prior_only", "warning", words, sigma, known, hint)
+            yield Finding("lens_prior_only", "warning", words, sigma, known)
         else:
             change = value - float(prior.value)
             numbers = {"change": change, "ratio": abs(change) / known}
