@@ -16,13 +16,11 @@ from jaxphoto.io.conditions import CONDITIONS, conditions_of, marked, read_condi
 from jaxphoto.io.photographs import SUFFIXES, picture_files
 from jaxphoto.io.result_tables import INPUTS, block_inputs, read_inputs, write_inputs
 from jaxphoto.io.text_files import read_json
-from jaxphoto.report.certificate import Certified, FormatBand, LastCalibration, certificate_page
+from jaxphoto.report.certificate import Certified, certificate_page
 from jaxphoto.report.page import write_pdf
 from jaxphoto.report.stability import Compared
 from jaxphoto.writing import InputFile, input_file, whole_file
 
-# Files that identify the previous calibration.
-_CAMERA_FILES = ("interior.csv", "correlation.csv", "camera.toml", "block.toml")
 _MEASUREMENTS = ("image_points.csv", *SUFFIXES)
 
 
@@ -38,8 +36,6 @@ def write_certificate(page: str, path: Path) -> None:
 def certificate_document(
     folder: Path,
     camera: str | None = None,
-    last: Path | None = None,
-    halves: Path | None = None,
     photographs: list[Path] | None = None,
 ) -> str:
     """Return the certificate of a result folder; for a flight, of its largest part.
@@ -72,34 +68,7 @@ def certificate_document(
             conditions=conditions,
             inputs=inputs,
             all_inputs=(folder / INPUTS).is_file(),
-            last=_last_calibration(file, folder, last) if last else None,
-            band=_format_band(halves) if halves else None,
         )
-    )
-
-
-def _last_calibration(current: CameraFile, folder: Path, last: Path) -> LastCalibration:
-    try:
-        file = read_camera_file(last, camera=current.name)
-    except InputError:
-        # Read the only camera: its name in the previous calibration may be different.
-        file = read_camera_file(last)
-    check_one_sensor(current, file, folder, last)
-    inside = results_in(last)
-    path = next((inside / name for name in _CAMERA_FILES if (inside / name).is_file()), last) if last.is_dir() else last
-    shared = share_measurements(folder, last)
-    return LastCalibration(last.name, file.interior, file.covariance, input_file(path, f"last/{path.name}"), shared)
-
-
-def _format_band(folder: Path) -> FormatBand:
-    summary = read_json(folder / "summary.json") if (folder / "cells.csv").is_file() else {}
-    if "sigma_factor" not in summary:
-        raise InputError(f"{folder} is not a result folder of jaxphoto halves; give one")
-    table = pd.read_csv(folder / "cells.csv")
-    factors = float(summary["factor"]), float(summary["sigma_factor"])
-    band = table["band_px"].to_numpy()
-    return FormatBand(
-        table[["x_mm", "y_mm"]].to_numpy(), band, *factors, input_file(folder / "cells.csv", "halves/cells.csv")
     )
 
 

@@ -20,9 +20,8 @@ from jaxphoto.report.formatting import of_sigma, with_sigma
 from jaxphoto.report.page import Heading, Paragraph, Part, Plot, hash_table, option_word, page
 from jaxphoto.report.plots import draw_distortion, draw_format_map, draw_matrix
 from jaxphoto.report.results import assumed_pixels
-from jaxphoto.report.stability import change_verdict, parameter_changes
 from jaxphoto.report.verdict import readout_of
-from jaxphoto.stability import LEVEL, NORMAL_95, Method, change, distortion_curve, frame_sigma, image_grid
+from jaxphoto.stability import NORMAL_95, Method, distortion_curve, frame_sigma, image_grid
 from jaxphoto.statistics import AxisErrors
 from jaxphoto.statistics.correlation import high_pairs
 from jaxphoto.writing import InputFile, digest_of_all
@@ -48,26 +47,6 @@ _QUANTITIES = (
 )  # fmt: skip
 
 
-class LastCalibration(NamedTuple):
-    """An earlier calibration of the same camera; `shared` if both have images in common."""
-
-    name: str
-    interior: InteriorOrientation
-    covariance: Float[np.ndarray, "q q"] | None
-    input: InputFile
-    shared: bool = False
-
-
-class FormatBand(NamedTuple):
-    """Split-half validation of the same camera (`jaxphoto halves`): 95 % radius of the errors over the image format."""
-
-    cells_mm: Float[np.ndarray, "cells 2"]
-    band_px: Float[np.ndarray, "cells"]
-    factor: float
-    sigma_factor: float
-    input: InputFile
-
-
 class Certified(NamedTuple):
     """A calibrated camera with the data and method of its calibration."""
 
@@ -85,8 +64,6 @@ class Certified(NamedTuple):
     inputs: Sequence[InputFile]
     all_inputs: bool
     """True if all input files are known, not only the image files."""
-    last: LastCalibration | None = None
-    band: FormatBand | None = None
 
     @property
     def sigma_factor(self) -> float:
@@ -95,8 +72,8 @@ class Certified(NamedTuple):
 
     @property
     def files(self) -> list[InputFile]:
-        """All known input files."""
-        return sorted({*self.inputs, *(part.input for part in (self.last, self.band) if part is not None)})
+        """All known input files, by name."""
+        return sorted(self.inputs)
 
 
 def certificate_page(certified: Certified) -> str:
@@ -105,7 +82,7 @@ def certificate_page(certified: Certified) -> str:
     foot = f"inputs SHA-256 {digest_of_all(certified.files)[:16]}" if certified.all_inputs else "inputs unknown"
     title = f"Certificate of calibration: {model or camera_words(certified.camera)}"
     parts = [*_camera(certified), *_method(certified), *_interior(certified), *_precision(certified)]
-    parts += [*_stability(certified), *_tests_and_inputs(certified)]
+    parts += _tests_and_inputs(certified)
     return page(title, parts, _statement(certified), foot=foot)
 
 
@@ -225,23 +202,16 @@ def _interior(certified: Certified) -> Iterator[Part]:
 
 
 def _precision(certified: Certified) -> Iterator[Part]:
-    covariance, names, band = certified.covariance, parameter_names(certified.interior), certified.band
+    covariance, names = certified.covariance, parameter_names(certified.interior)
     yield Heading("Precision over the format")
     if covariance is None:
         yield Paragraph("Precision and correlations are unknown: no covariance.")
         return
     points, scale = image_grid(certified.sensor, *_GRID), certified.sigma_factor / certified.sensor.pixel_mm
     maps = {w: scale * frame_sigma(certified.interior, covariance, points, how) for how, w in _ALIGNMENTS}
-    plots = [_map(certified, points, sigma, f"sigma [px], {words}") for words, sigma in maps.items()]
-    yield plots + ([_map(certified, band.cells_mm, band.band_px, "95 % by split halves [px]")] if band else [])
+    yield [_map(certified, points, sigma, f"sigma [px], {words}") for words, sigma in maps.items()]
     rows = [(w, *(f"{v:.3g}" for v in (s.min(), np.median(s), s.max()))) for w, s in maps.items()]
     yield pd.DataFrame(rows, columns=["RMS error of a ray [px]", "least", "median", "most"])
-    yield Paragraph(
-        f"Random halves of the block ({band.input.file}): standard deviations are to be multiplied by "
-        f"{band.factor:.2f} +- {band.sigma_factor:.2f}."
-        if band
-        else "By the covariance of the adjustment; no split-half validation (jaxphoto halves)."
-    )
     yield Heading("Correlations")
     sigma = np.sqrt(np.diagonal(covariance))
     free = np.flatnonzero(sigma > 0)
@@ -262,34 +232,11 @@ def _map(certified: Certified, cells_mm: np.ndarray, values: np.ndarray, name: s
     return Plot(draw, f"Map over the format: {name}, {values.min():.2g} to {values.max():.2g}")
 
 
-def _stability(certified: Certified) -> Iterator[Part]:
-    yield Heading("Stability since the last calibration")
-    last = certified.last
-    if last is None:
-        yield Paragraph("No earlier calibration was given (--last).")
-        return
-    points = image_grid(certified.sensor, *_GRID)
-    widened = None if certified.covariance is None else certified.covariance * certified.sigma_factor**2
-    changed = change(last.interior, certified.interior, points, (last.covariance, widened))
-    yield Paragraph(f"Compared with {last.name} (first: that, second: this).")
-    if last.shared:
-        yield Paragraph(
-            "Both calibrations have images in common: their agreement does not prove stability. Compare with a "
-            "calibration from other images."
-        )
-    yield from (Paragraph(as_sentence(sentence)) for sentence in change_verdict(changed, certified.sensor))
-    yield [
-        _map(certified, points, changed.offset_mm / certified.sensor.pixel_mm, "offset of rays [px]"),
-        _map(certified, points, changed.offset_mm / changed.limit_mm, f"offset over its {100 * LEVEL:.0f} % limit"),
-    ]
-    table = parameter_changes(changed).drop(columns="ratio")
-    yield table[table["sigma"] > 0]
-
-
 def _tests_and_inputs(certified: Certified) -> Iterator[Part]:
     of, files = certified.summary, certified.files
-    yield Heading("Check points")
-    yield from map(Paragraph, of.get("positional_accuracy") or ["None: no positional accuracy was tested."])
+    yield Heading("Check points: surveyed minus computed")
+    errors = pd.DataFrame.from_dict(of.get("check_points") or {}, orient="index")
+    yield errors.reset_index(names="axis") if len(errors) else Paragraph("None.")
     yield Heading("Findings")
     texts = [(f["severity"], as_sentence(f["text"])) for f in of.get("findings", [])]
     yield from [Paragraph(f"{severity.capitalize()}: {text}", severity) for severity, text in texts] or [

@@ -43,7 +43,7 @@ from jaxphoto.report.photographs import (
 )
 from jaxphoto.report.plots import axes_or_new, label, plot_links, plot_overlap, title
 from jaxphoto.report.residual_findings import component_findings, component_tables
-from jaxphoto.report.results import adjustment_sections, class_sentences, summary_table, write_results, write_summary
+from jaxphoto.report.results import adjustment_sections, summary_table, write_results, write_summary
 from jaxphoto.report.tables import Tables, with_correlated_sigma
 from jaxphoto.report.verdict import lens_findings, shutter_findings, verdict_of
 from jaxphoto.statistics.block_geometry import Coverage, coverage
@@ -234,8 +234,6 @@ def flight_summary(reports: Sequence[PartReport], n_images: int) -> pd.DataFrame
         rows |= flight_words(r.coverage, adjusted.block)
         rows["recorded positions"] = f"{len(used)} used, RMS difference {rms} m (X, Y, Z)" if len(used) else "none used"
         rows["surveyed points"] = f"{state.count('control')} control, {state.count('check')} check"
-        if classes := class_sentences(r.tables.tested_accuracy)[:2]:
-            rows["accuracy"] = " ".join(classes)
         columns[f"part {number}" if len(reports) > 1 else "value"] = pd.Series(rows)
     return pd.DataFrame(columns).fillna("").reset_index(names="quantity")
 

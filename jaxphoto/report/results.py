@@ -43,18 +43,12 @@ from jaxphoto.report.page import (
     versions,
 )
 from jaxphoto.report.tables import Tables, check_spread, recovery_spread, side_by_side, with_correlated_sigma
-from jaxphoto.statistics import (
-    LEAST_CHECK_POINTS,
-    LEAST_CHECKED,
-    LEVEL,
-    PositionalAccuracy,
-    global_test,
-)
+from jaxphoto.statistics import LEAST_CHECKED, LEVEL, global_test
 from jaxphoto.statistics.block_geometry import format_coverage
 from jaxphoto.writing import whole_folder
 
 _TABLES = (
-    "interior", "exterior", "object_points", "residuals", "trends", "check_points", "positional_accuracy",
+    "interior", "exterior", "object_points", "residuals", "trends", "check_points",
     "correlation", "correlation_summary", "correlation_ground", "sigma_map", "convergence",
 )  # fmt: skip
 # Additional tables if the files of the block are in an EPSG system.
@@ -69,7 +63,6 @@ _EFFECTS = {"pattern": "systematic effect", "freedom": "degrees of freedom", "sh
 # Classes in the table of object points: minimum number of rays of each class.
 _RAYS = (2, 3, 4, 6, 11, 21)
 _SMALL_DEG = 2.0
-_STANDARD = "ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2 (2023)"
 
 
 # Files -----------------------------------------------------------------------------------------------------------
@@ -159,7 +152,6 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
             for axis, n, mean, rmse, most, _ in check_spread(tables.check_points).itertuples(index=False)
             if n
         },
-        "positional_accuracy": accuracy_sentences(tables.tested_accuracy),
         "seconds": rounded(seconds),
         "versions": versions(),
     }
@@ -448,8 +440,6 @@ def _check_points(tables: Tables) -> Iterator[Part]:
     if len(tables.check_points):
         yield Heading("Check points: surveyed minus computed")
         yield check_spread(tables.check_points)
-        yield from map(Paragraph, accuracy_sentences(tables.tested_accuracy))
-        yield tables.positional_accuracy
         yield [
             Plot(partial(plots.plot_check_points, tables, upright=up),
                  f"discrepancies at check points in {'height' if up else 'plan'}", 3.8)
@@ -494,52 +484,3 @@ def assumed_pixel_words(sensors: Mapping[str, Sensor]) -> str:
 def assumed_pixels(sensors: Mapping[str, Sensor]) -> list[Part]:
     """Return a paragraph on cameras with assumed pixel size, if there are any."""
     return [Paragraph(words)] if (words := assumed_pixel_words(sensors)) else []
-
-
-# Positional accuracy ---------------------------------------------------------------------------------------------
-
-
-def accuracy_sentences(accuracy: PositionalAccuracy) -> list[str]:
-    """Return the tested accuracy class of each component, and why it cannot be claimed; empty without check points."""
-    if not accuracy.tested:
-        return []
-    sentences = [f"Positional accuracy by the {_STANDARD}; survey errors of the check points are included where known."]
-    sentences += class_sentences(accuracy)
-    if unknown := [t.name for t in accuracy.tested if math.isnan(t.survey_m) and t.n >= LEAST_CHECK_POINTS]:
-        sentences.append(
-            f"Survey standard deviations are missing for some check points ({', '.join(unknown)}): add them to "
-            "control_points.csv to claim the class."
-        )
-    sentences += [
-        f"The mean error in {axis.axis}, {_cm(axis.mean_m)}, exceeds a quarter of its RMSE ({_cm(axis.rmse_m)}): look "
-        "for a shift, such as of a datum or of a geoid, before signing."
-        for axis in accuracy.axes
-        if axis.biased
-    ]
-    if weak := [t.name for t in accuracy.tested[:2] if t.survey_m > t.rmse_m / 2]:
-        sentences.append(
-            f"The survey of the check points is not twice as accurate as the tested product ({', '.join(weak)}), as "
-            "the standard requires: survey them better."
-        )
-    return sentences
-
-
-def class_sentences(accuracy: PositionalAccuracy) -> list[str]:
-    """Return one sentence on the accuracy class of each component, horizontal first."""
-    sentences = []
-    for t in accuracy.tested:
-        survey, points = "unknown" if math.isnan(t.survey_m) else _cm(t.survey_m), counted(t.n, "check point")
-        measured = f"{t.symbol} = {_cm(t.rmse_m)} (block to check points {_cm(t.fit_m)}, survey {survey})"
-        accuracy_class = f"the {t.class_cm:g}-cm {t.symbol} {t.name} positional accuracy class"
-        few = f"tested with {points} only, where the standard asks for {LEAST_CHECK_POINTS}"
-        why = few if t.n < LEAST_CHECK_POINTS else f"tested with {points} whose survey errors are not all known"
-        sentences.append(
-            f"Tested with {points} to meet {accuracy_class}: {measured}."
-            if t.claimed
-            else f"Cannot be claimed: {why}: {measured}, which would be {accuracy_class}."
-        )
-    return sentences
-
-
-def _cm(metres: float) -> str:
-    return f"{100 * metres:.3g} cm"

@@ -123,11 +123,6 @@ class Tables:
         return statistics.camera_drifts(self.adjusted, self.covariance)
 
     @cached_property
-    def tested_accuracy(self) -> statistics.PositionalAccuracy:
-        """Positional accuracy at the check points."""
-        return statistics.positional_accuracy(statistics.check_discrepancies(self.adjusted))
-
-    @cached_property
     def ground_correlations(self) -> dict[str, statistics.GroundCorrelations]:
         """Correlations of each camera with height and doming of the ground."""
         return statistics.ground_correlations(self.adjusted, self.covariance)
@@ -315,11 +310,6 @@ class Tables:
         return table
 
     @cached_property
-    def positional_accuracy(self) -> pd.DataFrame:
-        """Accuracy (ASPRS Edition 2): component, check_points, fit_m, survey_m, rmse_m, class_cm, claimed."""
-        return accuracy_table(self.tested_accuracy)
-
-    @cached_property
     def correlation(self) -> pd.DataFrame:
         """Correlations of interior parameters and exterior orientations: parameter_a, parameter_b, rho.
 
@@ -433,13 +423,6 @@ def check_spread(check: pd.DataFrame) -> pd.DataFrame:
     values = check[[f"d{axis}_m" for axis in AXES]].set_axis(AXES, axis=1)
     spread = {"mean": values.mean(), "rmse": np.sqrt((values**2).mean()), "max_abs": values.abs().max()}
     return pd.DataFrame({"n": values.count(), **spread}).reset_index(names="axis").assign(unit="m")
-
-
-def accuracy_table(accuracy: statistics.PositionalAccuracy) -> pd.DataFrame:
-    """Tabulate the accuracy: component, check_points, fit_m, survey_m, rmse_m (including survey), class_cm, claimed."""
-    columns = ["component", "check_points", "fit_m", "survey_m", "rmse_m", "class_cm", "claimed"]
-    rows = [(t.symbol, t.n, t.fit_m, t.survey_m, t.rmse_m, t.class_cm, t.claimed) for t in accuracy.tested]
-    return pd.DataFrame(rows, columns=columns)
 
 
 def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) -> pd.DataFrame:

@@ -147,12 +147,10 @@ StartKeys = plan_keys(Approximation, position_m=NotNegative, angle_deg=NotNegati
 CoolingKeys = plan_keys(Cooling, time_constant_s=Positive, reference_c=Number | None)
 ChoiceKeys = plan_keys(Choice)
 PointKeys = plan_keys(
-    PointPlan, _PointKeys, min_images=Annotated[Count, Field(ge=2)], mean_rays=Positive,
+    PointPlan, _PointKeys, ties=Whole | None, min_images=Annotated[Count, Field(ge=2)], mean_rays=Positive,
     across=Positive, ends=NotNegative, margin_mm=NotNegative, on_roofs=Annotated[Number, Field(ge=0, le=1)],
 )  # fmt: skip
-TargetKeys = plan_keys(
-    TargetPlan, _TargetKeys, choice=ChoiceKeys,
-)  # fmt: skip
+TargetKeys = plan_keys(TargetPlan, _TargetKeys, choice=ChoiceKeys)  # fmt: skip
 _OBSERVED = dict.fromkeys((f.name for f in dataclasses.fields(Sigmas)), PositiveTriple)
 SigmaKeys = plan_keys(Sigmas, **_OBSERVED | {"image_mm": Positive, "target_mm": Positive | None})
 NoiseKeys = plan_keys(Sigmas, image_mm=NotNegative | None, target_mm=NotNegative | None)
