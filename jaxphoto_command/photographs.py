@@ -54,7 +54,6 @@ def fly(
 
     Unusable photographs are skipped and listed. Exit code 1: results written, but the verdict is red.
     """
-    import datetime
 
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.errors import counted
@@ -161,7 +160,6 @@ def fly(
                 provenance.conditions_for(flight.parts[0].adjusted.block.images),
                 provenance.inputs,
                 output.options(pairs=choice, features=number, longest_px=longest_px or LONGEST_PX),
-                datetime.date.today().isoformat(),
                 output.command_line(),
             )
 

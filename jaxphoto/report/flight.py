@@ -21,14 +21,15 @@ from jaxphoto.report.certificate import known_conditions
 from jaxphoto.report.findings import Finding, Verdict, as_sentence, symbol
 from jaxphoto.report.formatting import plus_minus, without_empty
 from jaxphoto.report.page import (
+    CommandRecord,
     Heading,
     Link,
     Paragraph,
     Part,
     Plot,
-    hash_table,
     option_word,
     page,
+    provenance,
     verdict_parts,
     versions,
 )
@@ -75,8 +76,6 @@ class FlightSource(NamedTuple):
     inputs: Sequence[InputFile] = ()
     entries: Mapping[str, Any] = MappingProxyType({})
     """Additional entries of summary.json: options and inputs."""
-    written: str = ""
-    """Creation date of the results."""
     command: str = ""
     """Command line."""
 
@@ -396,23 +395,17 @@ def images_section(reports: Sequence[PartReport]) -> Iterator[Part]:
     yield without_empty(table.drop(columns=[*unknown, *([] if len(reports) > 1 else ["part"])])).round(3)
 
 
-def provenance_section(source: FlightSource) -> Iterator[Part]:
-    """Yield dates, camera, conditions, command, options, versions, and hashes of all input files except images."""
-    conditions = source.conditions
-    rows = {"computed": source.written} | known_conditions(conditions)
-    rows["command"] = source.command
+def provenance_section(source: FlightSource) -> list[Part]:
+    """Return conditions, command, options, versions, and hashes of all input files except images."""
+    images = {c.file for c in source.conditions}
+    others = [f for f in source.inputs if f.file not in images]
     method = {k: v for k, v in dict(source.entries.get("method", {})).items() if k != "command" and v is not None}
+    rows = known_conditions(source.conditions)
     rows["options as used"] = ", ".join(f"{k} {option_word(v)}" for k, v in method.items())
-    rows["versions"] = ", ".join(f"{name} {number}" for name, number in versions().items())
     if source.inputs:
-        rows[f"SHA-256 of all {len(source.inputs)} inputs"] = digest_of_all(source.inputs)
-    yield Heading("Provenance")
-    yield {name: value for name, value in rows.items() if value}
-    images = {c.file for c in conditions}
-    if others := [f for f in source.inputs if f.file not in images]:
-        yield hash_table(others)
-    if source.inputs:
-        yield Paragraph("result/inputs.csv has the SHA-256 of every file; certificate.html is the document to sign.")
+        rows[f"SHA-256 of all {len(source.inputs)} inputs (result/inputs.csv)"] = digest_of_all(source.inputs)
+    heading, about, *hashes = provenance(CommandRecord(source.command, others))
+    return [heading, {**about, **rows}, *hashes]  # type: ignore[dict-item]
 
 
 # Files -----------------------------------------------------------------------------------------------------------

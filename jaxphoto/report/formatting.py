@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -236,7 +237,7 @@ def to_markdown(table: pd.DataFrame, name: str = "") -> str:
 def to_latex(table: pd.DataFrame, name: str = "") -> str:
     """Convert a table to LaTeX with booktabs rules (\\usepackage{booktabs})."""
     columns = "".join("r" if right else "l" for right in numeric_columns(table))
-    names = {"caption": head_of(name), "label": f"tab:{name}"} if name else {}
+    names: dict[str, Any] = {"caption": head_of(name), "label": f"tab:{name}"} if name else {}
     return readable(table).rename(columns=head_of).to_latex(index=False, escape=True, column_format=columns, **names)
 
 

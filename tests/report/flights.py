@@ -55,5 +55,5 @@ def source() -> FlightSource:
         ("positions are of EXIF",), "c is the focal length of EXIF.", BROWN,
         (Conditions("i0", "i0.jpg", "0" * 64, time="2024-05-01 10:00:00"),),
         (InputFile("i0.jpg", 3, "0" * 64), InputFile("survey.csv", 5, "ab" * 32)),
-        {"method": {"command": "fly", "features": 500, "epsg": None}}, "2024-05-02", "jaxphoto fly photographs",
+        {"method": {"command": "fly", "features": 500, "epsg": None}}, "jaxphoto fly photographs",
     )  # fmt: skip

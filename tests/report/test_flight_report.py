@@ -48,7 +48,7 @@ def test_the_documentation_lists_the_sections_of_the_page(page):
     document = (
         (Path(__file__).parents[2] / "docs" / "report.md").read_text(encoding="utf-8").split("## Report of a flight")[1]
     )
-    listed = re.findall(r"^\| ([^|]+) \|", document.split("\n\nThe rms")[0], re.MULTILINE)[2:]
+    listed = re.findall(r"^\| ([^|]+) \|", document.split("\n\nEquivalent terms")[0], re.MULTILINE)[2:]
     assert [t for t in told if t not in ("Part 2", "Files")] == [t for t in listed if t in told]
     # Sections of blocks with control, check points, more than one mount, or variance components.
     optional = {"Mounts and strips", "Control points", "Check points: surveyed minus computed", "Variance components"}
