@@ -80,7 +80,7 @@ def printed_table(cells: pd.DataFrame) -> pd.DataFrame:
     return pd.DataFrame(rows.values(), index=list(rows)).fillna("").reset_index(names="row")
 
 
-def cell_words(cell: Mapping[str, Any]) -> tuple[str, str]:
+def cell_words(cell: Mapping[Any, Any]) -> tuple[str, str]:
     """Format the computed and the published value of a cell; "" if missing."""
     ours, spread, published, tolerance = (float(cell[k]) for k in ("ours", "spread", "published", "tolerance"))
     computed = plus_minus(ours, spread) if spread > 0 else f"{ours:.6g}"
@@ -138,7 +138,8 @@ def plot_comparison(comparison: pd.DataFrame, table: str, column: str, ax: Axes 
         )
     ax, at = axes_or_new(ax), np.array([rows.index(row) for row in of["row"]])
     bars: dict[str, Any] = {"capsize": 2, "lw": 1, "ls": "none"}
-    printed, ours = {"marker": "s", "ms": 5, "mfc": "none", "color": "0.45"}, {"marker": "o", "ms": 4}
+    printed: dict[str, Any] = {"marker": "s", "ms": 5, "mfc": "none", "color": "0.45"}
+    ours: dict[str, Any] = {"marker": "o", "ms": 4}
     ax.errorbar(of["published"], at - 0.15, xerr=of["tolerance"], label="printed ± tolerance", **printed, **bars)
     ax.errorbar(of["ours"], at + 0.15, xerr=of["spread"], label="ours ± spread", **ours, **bars)
     ax.set_title(heading(column, of["unit"].iloc[0]), fontsize=9)
@@ -183,9 +184,10 @@ def plot_agreement(comparison: pd.DataFrame, ax: Axes | None = None) -> Axes:
     ax = axes_or_new(ax)
     off = ((cells["ours"] - cells["published"]) / cells["tolerance"]).to_numpy(float)
     place, tables = pd.factorize(cells["table"])
-    number, of = cells.groupby("table").cumcount().to_numpy(), cells.groupby("table")["table"].transform("size")
+    number = cells.groupby("table").cumcount().to_numpy()
+    of = cells.groupby("table")["table"].transform("size").to_numpy()
     # Arrange the values of a table from top to bottom, in the order of the paper.
-    at = place + 0.7 * (number / np.maximum(of - 1, 1).to_numpy() - 0.5)
+    at = place + 0.7 * (number / np.maximum(of - 1, 1) - 0.5)
     within = (cells["within"] == "yes").to_numpy()
     ax.axvspan(-1, 1, color="0.93", lw=0)
     for rows, marker, colour, label in ((within, "o", "tab:blue", "within"), (~within, "x", "tab:red", "not within")):

@@ -215,7 +215,8 @@ def _precision(certified: Certified) -> Iterator[Part]:
     yield Heading("Correlations")
     sigma = np.sqrt(np.diagonal(covariance))
     free = np.flatnonzero(sigma > 0)
-    names, rho = [names[k] for k in free], covariance[np.ix_(free, free)] / sigma[free, None] / sigma[free]
+    names = tuple(names[k] for k in free)
+    rho = covariance[np.ix_(free, free)] / sigma[free, None] / sigma[free]
     high = [f"{symbol(a)} and {symbol(b)} {r:+.3f}" for a, b, r in high_pairs(names, rho, _HIGH)]
     words = f"Above {_HIGH}: {', '.join(high)}; interpret these jointly." if high else f"None is above {_HIGH}."
     draw = partial(draw_matrix, values=rho, rows=names, columns=names, name="correlation of the interior orientation")

@@ -110,8 +110,9 @@ def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Ax
     if quantity not in quantities or quantity not in draws:
         names = ", ".join(name for name in quantities if name in draws and not name.startswith(LONG))
         raise InputError(f"unknown quantity {quantity!r} of the draws; use one of {names}, or one of images or points")
-    ax, of = axes_or_new(ax), summary.set_index("quantity").loc[quantity]
-    values, nominal, sigma = draws[quantity].to_numpy(float), float(of["nominal"]), float(of["predicted_sigma"])
+    ax, of = axes_or_new(ax), summary[summary["quantity"] == quantity]
+    nominal, sigma = of[["nominal", "predicted_sigma"]].to_numpy(float)[0]
+    values = draws[quantity].to_numpy(float)
     # Skip the histogram if draws differ only by rounding.
     if len(values) and np.ptp(values) > 1e-12 * np.abs(values).max(initial=1e-300):
         ax.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")

@@ -306,8 +306,8 @@ def offset_statistics(table: pd.DataFrame) -> pd.DataFrame:
     for axis in AXES:
         d = table.set_index("image")[f"d{axis}_m"].dropna().astype(float)
         if len(d):
-            most = d.abs().idxmax()
-            rows.append((axis, len(d), d.mean(), d.std(), np.sqrt((d**2).mean()), d[most], most))
+            k = int(d.abs().argmax())
+            rows.append((axis, len(d), d.mean(), d.std(), np.sqrt((d**2).mean()), d.iloc[k], d.index[k]))
     return pd.DataFrame(rows, columns=["axis", "n", "mean_m", "sd_m", "rms_m", "largest_m", "image"]).round(3)
 
 
@@ -367,8 +367,8 @@ def surveyed_section(report: PartReport) -> list[Part]:
     table["marks_rms_px"] = [float(np.sqrt(np.mean(m**2))) if len(m) else np.nan for m in marks]
     table["largest_w"] = table[[f"w_{axis}" for axis in AXES]].max(axis=1)
     columns = ["point", "role", "state", "n_marks", *(f"d{axis}_m" for axis in AXES), "largest_w", "marks_rms_px"]
-    words = [Paragraph(" ".join(map(as_sentence, control.sentences)))] if control.sentences else []
-    return [Heading("Surveyed points"), pd.DataFrame(rows), *words, table[columns].round(3)]
+    said: list[Part] = [Paragraph(" ".join(map(as_sentence, control.sentences)))] if control.sentences else []
+    return [Heading("Surveyed points"), pd.DataFrame(rows), *said, table[columns].round(3)]
 
 
 def axis_cell(off_m: np.ndarray, rms_m: float) -> str:

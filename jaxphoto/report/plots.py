@@ -339,9 +339,10 @@ def plot_sigma_map(
 
 def draw_sigma_map(axes: Axes, sensor: Sensor, one: SigmaMap) -> None:
     """Draw the standard deviation in the worst direction (px)."""
-    known = np.isfinite(one.worst)
+    worst = np.asarray(one.worst)
+    known = np.isfinite(worst)
     name = f"sigma {distance_words(one.distance_m)}, worst direction [px]"
-    draw_format_map(axes, sensor, one.points[known], name, one.worst[known] / sensor.pixel_mm)
+    draw_format_map(axes, sensor, np.asarray(one.points)[known], name, worst[known] / sensor.pixel_mm)
 
 
 def distance_words(distance_m: float) -> str:

@@ -171,7 +171,7 @@ def plot_sensitivity(tables: SensitivityTables, title: str, ax: Axes | None = No
     ax, names = axes_or_new(ax), tables.panels[title]
     chosen = tables.bias[tables.bias["estimate"].isin(names)]
     by = chosen.groupby(["unit", "axis"], sort=False)[["exact", "first_order", "difference"]]
-    values = by.sum() if len(names) == 1 else by.agg(lambda v: float(np.sqrt((v**2).mean())))
+    values = by.sum() if len(names) == 1 else by.agg(_rms)
     at = np.arange(len(values))
     for k, (name, colour) in enumerate((("exact", "tab:blue"), ("first_order", "0.6"), ("difference", "tab:red"))):
         ax.bar(at + 0.27 * (k - 1), values[name], 0.27, color=colour, label=name.replace("_", " "))
@@ -181,6 +181,10 @@ def plot_sensitivity(tables: SensitivityTables, title: str, ax: Axes | None = No
     ax.tick_params(axis="y", labelsize=8)
     ax.legend(fontsize=7)
     return ax
+
+
+def _rms(values: pd.Series) -> float:
+    return float(np.sqrt((values**2).mean()))
 
 
 def write_sensitivity(

@@ -47,11 +47,11 @@ def sweep_table(sweep: Sweep) -> pd.DataFrame:
     names = list(sweep.parameters[0])
     if taken := [name for name in names if name in _COLUMNS]:
         raise InputError(f"design parameter {taken[0]} has the name of a table column; rename it")
-    columns = pd.DataFrame(dict(_columns(sweep)))
+    columns = pd.DataFrame({"|".join(key): values for key, values in _columns(sweep)})
     designs = pd.DataFrame([dict(p) for p in sweep.parameters], columns=names)
     designs = designs.assign(design=np.arange(len(sweep)) + 1, converged=sweep.converged, determined=sweep.determined)
     keys = designs.columns.tolist()
-    wide = pd.concat([designs, columns.set_axis(["|".join(key) for key in columns], axis=1)], axis=1)
+    wide = designs.join(columns)
     table = wide.melt(keys, var_name="key", value_name="value").sort_values("design", kind="stable")
     table[["quantity", "of"]] = table.pop("key").str.split("|", expand=True)
     table["unit"] = table["of"].map(lambda of: without_unit(of)[1]).where(table["quantity"].isin(_WITH_UNIT), "")

@@ -252,6 +252,9 @@ class Tables:
         def names(of: Callable[[str, AbstractObservations], Any]) -> pd.Categorical:
             return pd.Categorical(column(lambda g, rows: np.asarray(of(g, rows), object)))
 
+        def numbers(values: Mapping[str, ArrayLike]) -> np.ndarray:
+            return column(lambda g, rows: values[g])
+
         def in_units(values: Mapping[str, ArrayLike]) -> np.ndarray:
             return column(lambda g, rows: in_file_unit(rows.unit)[0] * np.asarray(values[g]))
 
@@ -264,12 +267,10 @@ class Tables:
             "point": names(lambda g, rows: rows.names_of("point", block.points)), "axis": names(axis),
             "residual": in_units(residual), "sigma": in_units(sigma),
             "unit": names(lambda g, rows: in_file_unit(rows.unit)[1]),
-            "redundancy_number": column(lambda g, rows: self.redundancy.named[g]),
-            "w": column(lambda g, rows: self.w.named[g]),
+            "redundancy_number": numbers(self.redundancy.named), "w": numbers(self.w.named),
             "detectable": in_units(detectable),
-            **{f"{p.removesuffix('_mm')}_moves": column(lambda g, rows, v=v: v[g])
-               for p, v in self.undetected.interior.items()},
-            "most_moves": column(lambda g, rows: self.undetected.most[g]),
+            **{f"{p.removesuffix('_mm')}_moves": numbers(v) for p, v in self.undetected.interior.items()},
+            "most_moves": numbers(self.undetected.most),
         }  # fmt: skip
         return pd.DataFrame(columns, copy=False)
 
