@@ -69,12 +69,8 @@ def in_degrees(name: str) -> str:
     return name.removesuffix("_rad") + "_deg" if name.endswith("_rad") else name
 
 
-def column_of(path: str) -> str:
-    """Convert `interior[kodak].c_mm` to `kodak.c_mm`, `strips[E1].shift_X_m` to `strips.E1.shift_X_m`."""
-    return in_degrees(_in_radians(path))
-
-
 def _in_radians(path: str) -> str:
+    """Convert `interior[kodak].c_mm` to `kodak.c_mm`, `strips[E1].shift_X_m` to `strips.E1.shift_X_m`."""
     if "[" not in path:
         return path
     kind, rest = path.split("[", 1)
