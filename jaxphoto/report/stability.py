@@ -47,11 +47,12 @@ class Compared(NamedTuple):
 
 def about_sets(sets: tuple[Compared, Compared]) -> list[str]:
     """Describe both calibrations, the source of the uncertainty, and assumed pixel sizes."""
-    uncertainty = (
-        "Neither set has a covariance: no uncertainty is given.",
-        "The set without covariance is assumed exact: the uncertainty is that of the other set.",
-        "Uncertainty from the covariances of both sets, assuming different images.",
-    )[sum(one.known for one in sets)]
+    without = [one.name for one in sets if not one.known]
+    exact = f"{' '.join(without)} has no covariance and is assumed exact: the uncertainty is that of the other set."
+    uncertainty = {
+        0: "Uncertainty from the covariances of both sets, assuming different images.", 1: exact,
+        2: "Neither set has a covariance: no uncertainty is given.",
+    }[len(without)]  # fmt: skip
     assumed = assumed_pixel_words({one.name: one.sensor for one in sets})
     return [str(sets[0]), str(sets[1]), uncertainty, *([assumed] if assumed else [])]
 
