@@ -81,5 +81,3 @@ def test_a_shift_of_check_points_exceeds_chance():
     axes = [AxisErrors(a, 3, d.mean(), np.sqrt((d**2).mean())) for a, d in zip("XYZ", errors.T, strict=True)]
     assert [axis.biased for axis in axes] == [False, True, False]
     assert not AxisErrors("X", 1, 0.05, 0.05).biased
-
-
