@@ -7,7 +7,6 @@ EXTRAS = {
     "laspy": "lidar", "lazrs": "lidar", "rasterio": "lidar",
     "cv2": "photos", "pycolmap": "photos",
     "pyarrow": "parquet",
-    "plotly": "report", "xarray": "report",
     "blackjax": "posterior",
 }  # fmt: skip
 """Extra of jaxphoto that installs each optional module."""

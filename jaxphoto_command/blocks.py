@@ -158,14 +158,12 @@ def certificate(
     output: Output,
     results: Annotated[Path, Argument(help="Result folder of adjust or fly.")],
     out: Annotated[Path, Option(help="Certificate to write (.html or .pdf).")],
-    last: Annotated[Path | None, Option(help="Previous calibration to compare (results or camera file).")] = None,
-    halves: Annotated[Path | None, Option(help="Result folder of jaxphoto halves for this block.")] = None,
     photographs: Annotated[
         list[Path] | None, Option(help="Photographs or their folders, if not in the results.")
     ] = None,
     camera: opt.Camera = None,
 ) -> None:
-    """Write a calibration certificate: parameters, precision, stability, inputs."""
+    """Write a calibration certificate: parameters, precision, inputs."""
     from jaxphoto.io.result_tables import read_summary, reservation
     from jaxphoto.writing import check_room
     from jaxphoto_command.certificate import certificate_document, write_certificate
@@ -174,7 +172,7 @@ def certificate(
         raise typer.BadParameter(f"--out {out}: give a file that ends in .html or .pdf.")
     check_room(out)
     with output.progress(f"writing {out}"):
-        write_certificate(certificate_document(results, camera, last, halves, photographs or []), out)
+        write_certificate(certificate_document(results, camera, photographs or []), out)
     if text := reservation(read_summary(results)):
         output.warn(text)
     output.wrote(out, f"certificate in {out}")
@@ -367,7 +365,7 @@ def halves(
     from jaxphoto.io import read_block
     from jaxphoto.procedures.compare import camera_of
     from jaxphoto.procedures.compare import halves as compare_halves
-    from jaxphoto.report.stability import print_halves, write_halves
+    from jaxphoto.report.stability import halves_verdict, write_halves
     from jaxphoto.writing import check_folder
 
     check_folder(out, block)
@@ -387,7 +385,7 @@ def halves(
 
         write_halves(result, out, write_camera, record)
     warn_of_contradictions(result.adjusted, output)
-    print_halves(result, output.screen)
+    output.say(*halves_verdict(result))
     output.wrote(out, f"results in {out} (open report.html)")
 
 

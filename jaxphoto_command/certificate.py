@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 import equinox as eqx
-import numpy as np
+import pandas as pd
 
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import InputError
@@ -16,15 +16,11 @@ from jaxphoto.io.conditions import CONDITIONS, conditions_of, marked, read_condi
 from jaxphoto.io.photographs import SUFFIXES, picture_files
 from jaxphoto.io.result_tables import INPUTS, block_inputs, read_inputs, write_inputs
 from jaxphoto.io.text_files import read_json
-from jaxphoto.io.text_tables import read_csv
-from jaxphoto.report.certificate import Certified, ExteriorCorrelation, FormatBand, LastCalibration, certificate_page
+from jaxphoto.report.certificate import Certified, certificate_page
 from jaxphoto.report.page import write_pdf
 from jaxphoto.report.stability import Compared
 from jaxphoto.writing import InputFile, input_file, whole_file
 
-_MIN_CELLS = 4
-# Files that identify the previous calibration.
-_CAMERA_FILES = ("interior.csv", "correlation.csv", "camera.toml", "block.toml")
 _MEASUREMENTS = ("image_points.csv", *SUFFIXES)
 
 
@@ -40,8 +36,6 @@ def write_certificate(page: str, path: Path) -> None:
 def certificate_document(
     folder: Path,
     camera: str | None = None,
-    last: Path | None = None,
-    halves: Path | None = None,
     photographs: list[Path] | None = None,
 ) -> str:
     """Return the certificate of a result folder; for a flight, of its largest part.
@@ -61,6 +55,8 @@ def certificate_document(
         conditions = read_conditions(folder / CONDITIONS)
     if (folder / INPUTS).is_file():
         inputs += read_inputs(folder / INPUTS)
+    path = folder / "correlation_summary.csv"
+    correlations = pd.read_csv(path) if path.is_file() else pd.DataFrame({"camera": []})
     return certificate_page(
         Certified(
             camera=file.name,
@@ -68,49 +64,12 @@ def certificate_document(
             interior=file.interior,
             covariance=file.covariance,
             summary=read_json(folder / "summary.json"),
-            with_exterior=_exterior_correlations(folder, file.name),
+            with_exterior=correlations[correlations["camera"].astype(str) == file.name],
             conditions=conditions,
             inputs=inputs,
             all_inputs=(folder / INPUTS).is_file(),
-            last=_last_calibration(file, folder, last) if last else None,
-            band=_format_band(halves) if halves else None,
         )
     )
-
-
-def _exterior_correlations(folder: Path, camera: str) -> list[ExteriorCorrelation]:
-    path = folder / "correlation_summary.csv"
-    if not path.is_file():
-        return []
-    table = read_csv(path, ("camera", "exterior", "interior", "mean_abs_rho", "max_abs_rho"), text=("exterior",))
-    rows = table.take(table.ids("camera") == camera)
-    labels = (rows.ids(name).tolist() for name in ("exterior", "interior"))
-    values = (rows.numbers(name).tolist() for name in ("mean_abs_rho", "max_abs_rho"))
-    return [ExteriorCorrelation(*row) for row in zip(*labels, *values, strict=True)]
-
-
-def _last_calibration(current: CameraFile, folder: Path, last: Path) -> LastCalibration:
-    try:
-        file = read_camera_file(last, camera=current.name)
-    except InputError:
-        # Read the only camera: its name in the previous calibration may be different.
-        file = read_camera_file(last)
-    check_one_sensor(current, file, folder, last)
-    inside = results_in(last)
-    path = next((inside / name for name in _CAMERA_FILES if (inside / name).is_file()), last) if last.is_dir() else last
-    shared = share_measurements(folder, last)
-    return LastCalibration(last.name, file.interior, file.covariance, input_file(path, f"last/{path.name}"), shared)
-
-
-def _format_band(folder: Path) -> FormatBand:
-    path, summary = folder / "cells.csv", read_json(folder / "summary.json")
-    columns = ("x_mm", "y_mm", "band_px")
-    table = read_csv(path, columns, ("promised_px", "factor", "halves_px", "halves_band_px"))
-    x, y, band = (table.numbers(name) for name in columns)
-    factor, sigma = (summary.get(name) for name in ("factor", "sigma_factor"))
-    if not all(isinstance(v, int | float) and math.isfinite(v) for v in (factor, sigma)) or len(band) < _MIN_CELLS:
-        raise InputError(f"{folder} is not a result folder of jaxphoto halves; give one")
-    return FormatBand(np.stack([x, y], axis=1), band, float(factor), float(sigma), input_file(path, "halves/cells.csv"))  # type: ignore[arg-type]
 
 
 def read_two(

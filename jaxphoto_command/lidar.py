@@ -67,7 +67,7 @@ def lidar_control(
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.procedures.lidar import lidar_control
     from jaxphoto.procedures.lidar.vertical_control import flag_counts
-    from jaxphoto.report.lidar import heights_figure, heights_page, heights_table, print_rounds, rounds_table
+    from jaxphoto.report.lidar import heights_page, heights_table, rounds_table, rounds_words
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
     selection = {"classes": opt.class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
@@ -78,14 +78,12 @@ def lidar_control(
         result = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)  # type: ignore[arg-type]
         progress.update(f"writing {out}")
         heights, rounds = heights_table(result), rounds_table(result.rounds)
-        picture = heights_figure(result)
-        page = heights_page(result, picture, output.command_record(block, cloud))
+        page = heights_page(result, output.command_record(block, cloud))
         with whole_block(result.block, out) as folder:
             heights.to_csv(folder / "lidar_heights.csv", index=False)
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
-            picture.savefig(folder / "lidar_heights.png")
             (folder / "report.html").write_text(page, encoding="utf-8")
-    print_rounds(result.rounds, result.converged, output.screen)
+    output.say(*rounds_words(result.rounds, result.converged))
     rejected = flag_counts(result.flag[~np.isfinite(result.height)]).items()
     note = f" (rejected: {', '.join(f'{name.lower()} {n}' for name, n in rejected)})" if rejected else ""
     used = int(result.used.sum())
@@ -114,7 +112,7 @@ def roof_control(
     from jaxphoto.io.block_folder import check_block_target
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.procedures.lidar import roof_control
-    from jaxphoto.report.lidar import print_rounds
+    from jaxphoto.report.lidar import rounds_words
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=0.0)
     selection = {"classes": opt.class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
@@ -125,7 +123,7 @@ def roof_control(
         result = roof_control(read, points, settings, centroids=opt.names(centroids), **options)
         progress.update(f"writing {out}")
         write_block(result.block, out)
-    print_rounds(result.rounds, result.converged, output.screen)
+    output.say(*rounds_words(result.rounds, result.converged))
     output.wrote(out, f"wrote {out}: {len(result.points)} tie points lie on {result.faces} roof faces")
     output.add(n_tie_points=len(result.points), n_roof_faces=result.faces)
     _end_of_rounds(output, result)
@@ -187,7 +185,8 @@ def simultaneous(
     from jaxphoto.lidar.coverage import check_covered
     from jaxphoto.lidar.strip_planes import StripSettings
     from jaxphoto.procedures.lidar import simultaneous
-    from jaxphoto.report.lidar import print_moved, print_rounds, write_simultaneous
+    from jaxphoto.report.formatting import to_rich
+    from jaxphoto.report.lidar import moved_table, rounds_words, write_simultaneous
     from jaxphoto.writing import check_folder
     from jaxphoto_command.strip_flight import (
         StripChoices,
@@ -247,8 +246,8 @@ def simultaneous(
             if trajectory is not None and records is not None and result.trajectory is not None:
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 write_moved(moved._replace(time=moved.time + trajectory_shift_s), trajectory, folder)
-    print_rounds(result.rounds, result.converged, output.screen)
-    print_moved(result, output.screen)
+    output.say(*rounds_words(result.rounds, result.converged))
+    output.screen.print(to_rich(moved_table(result), "changes"))
     output.wrote(out, f"results in {out}")
     if not result.converged:
         raise typer.Exit(1)

@@ -54,7 +54,6 @@ def fly(
 
     Unusable photographs are skipped and listed. Exit code 1: results written, but the verdict is red.
     """
-    import datetime
 
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.errors import counted
@@ -81,14 +80,8 @@ def fly(
     from jaxphoto.procedures.control.of_flight import flight_control
     from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
     from jaxphoto.report import prepare_pictures
-    from jaxphoto.report.flight import (
-        FlightSource,
-        block_folder,
-        camera_sentences,
-        report_of,
-        write_flight,
-        write_part_orientation,
-    )
+    from jaxphoto.report.flight import FlightSource, camera_sentences, part_folder, report_of, write_flight
+    from jaxphoto.report.photographs import write_orientation
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.certificate import Provenance, certify
 
@@ -164,11 +157,9 @@ def fly(
                 positions.sentences,
                 camera.origin,
                 initial,
-                taken,
                 provenance.conditions_for(flight.parts[0].adjusted.block.images),
                 provenance.inputs,
                 output.options(pairs=choice, features=number, longest_px=longest_px or LONGEST_PX),
-                datetime.date.today().isoformat(),
                 output.command_line(),
             )
 
@@ -177,8 +168,9 @@ def fly(
 
             verdict = write_flight(flight, reports, corrupt, work, source, write_provenance)
             for k, part in enumerate(flight.parts, 1):
-                with whole_block(part.adjusted.block, work / block_folder(k)) as folder:
-                    write_part_orientation(part, folder)
+                with whole_block(part.adjusted.block, work / part_folder(k, "block")) as folder:
+                    matching = {"n_gross": part.matched.n_gross, "sigma_factor": part.matched.sigma_factor}
+                    write_orientation(part.oriented, folder, **matching)
                     write_provenance(part, folder)
             no_certificate = certify(work)
         checkpoint.remove()
@@ -225,9 +217,9 @@ def control(
     from jaxphoto.procedures.adjust import adjust
     from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
     from jaxphoto.report import Tables, verdict_of
-    from jaxphoto.report.control import control_findings, control_summary, write_control
     from jaxphoto.report.findings import Verdict
     from jaxphoto.report.page import versions
+    from jaxphoto.report.photographs import control_findings, control_summary, write_control
     from jaxphoto.report.results import write_results, write_summary
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.certificate import Provenance
@@ -315,7 +307,7 @@ def calibrate(
     from jaxphoto.io.photographs import photographs, sensor_and_interior
     from jaxphoto.procedures.calibration import calibrate, distortion_model, free_parameters
     from jaxphoto.report import prepare_pictures, print_adjustment, verdict_of
-    from jaxphoto.report.target_calibration import print_calibration, write_calibration
+    from jaxphoto.report.photographs import print_calibration, write_calibration
     from jaxphoto.writing import check_folder
 
     check_folder(out, *images)
@@ -393,7 +385,7 @@ def orient(
     from jaxphoto.io.text_files import read_json
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.orientation import orient
-    from jaxphoto.report.orientation import print_orientation, write_orientation
+    from jaxphoto.report.photographs import orientation_sentences, write_orientation
 
     check_block_target(out, *images)
     if len(images) == 1 and (images[0] / TOML).is_file():
@@ -453,7 +445,7 @@ def orient(
         f"{matched.n_gross} matches rejected before orientation (off the epipolar line, or in pairs with too few); "
         f"sigma factor of the others {matched.sigma_factor:.2g}"
     )
-    print_orientation(result.report, output.screen)
+    output.say(*orientation_sentences(result.report))
     output.wrote(out, f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR")
     output.add(**read_json(out / "orientation.json"))
     if not result.report.converged:

@@ -65,7 +65,7 @@ def test_it_says_what_the_results_say(results, tmp_path, monkeypatch, capsys):
     assert f"{interior.loc['c_mm', 'value']:.{places}f}" in page
     for file in (results.parent / "block").glob("*.csv"):
         assert hashlib.sha256(file.read_bytes()).hexdigest() in page
-    for heading in ("Interior orientation", "Distortion", "Precision", "Correlations", "Stability", "Inputs"):
+    for heading in ("Interior orientation", "Distortion", "Precision", "Correlations", "Inputs"):
         assert heading in page
 
 
@@ -103,29 +103,12 @@ def test_nothing_is_claimed_of_inputs_without_hashes(results, tmp_path, monkeypa
     untold = tmp_path / "untold"
     shutil.copytree(results, untold)
     (untold / "inputs.csv").unlink()
-    page = certified(untold, tmp_path / "b.html", monkeypatch, capsys, "--last", results).decode()
+    page = certified(untold, tmp_path / "b.html", monkeypatch, capsys).decode()
     assert again not in page and "Incomplete: the results have no hashes" in page and "inputs unknown" in page
     (tmp_path / "photographs").mkdir()
     Image.new("RGB", (32, 24)).save(tmp_path / "photographs" / "a.jpg")
     given = ("--photographs", tmp_path / "photographs")
     assert again not in certified(untold, tmp_path / "c.html", monkeypatch, capsys, *given).decode()
-
-
-def test_against_itself_a_camera_has_not_changed(results, tmp_path, monkeypatch, capsys):
-    page = certified(results, tmp_path / "a.html", monkeypatch, capsys, "--last", results).decode()
-    assert "No earlier calibration was given" not in page
-    # Nothing that two calibrations of the same measurements could say of a change.
-    shared = "have images in common"
-    assert shared in page
-    shutil.copytree(results, tmp_path / "other")
-    inputs = tmp_path / "other" / "inputs.csv"
-    inputs.write_text(inputs.read_text().replace("image_points.csv", "other.csv"))
-    assert shared not in certified(results, tmp_path / "o.html", monkeypatch, capsys, "--last", inputs.parent).decode()
-    # The folder of a flight has them in one of its own.
-    (tmp_path / "flight").mkdir()
-    shutil.copytree(results, tmp_path / "flight" / "result")
-    again = certified(results, tmp_path / "b.html", monkeypatch, capsys, "--last", tmp_path / "flight").decode()
-    assert again == page.replace("Compared with results", "Compared with flight")
 
 
 def test_bad_input_is_one_sentence(results, tmp_path, monkeypatch, capsys):

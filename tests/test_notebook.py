@@ -34,7 +34,7 @@ PANELS = (
     "plot_residuals", "plot_mean_residuals", "plot_density", "plot_check_points", "plot_interior_correlation",
     "plot_exterior_correlation", "plot_sigma_map", "plot_distortion", "plot_error_ellipses", "plot_residuals_by_radius",
     "plot_station_residuals", "plot_distortion_band", "plot_convergence", "plot_intersection_angles",
-    "plot_point_sigmas", "plot_overlap", "plot_rays", "plot_links", "plot_link_strength",
+    "plot_overlap", "plot_links",
 )  # fmt: skip
 
 

@@ -51,7 +51,6 @@ def test_photographs_become_a_block(taken, tmp_path, monkeypatch, capsys):
     # Simulated rays err independently.
     assert 1 <= summary["alike"] < 1.2
     assert summary["matching"] == {"n_gross": 2 * summary["n_pairs"], "sigma_factor": 1.0}
-    assert {p.name for p in out.glob("*.png")} == {"orientation_network.png", "orientation_residuals.png"}
 
 
 @pytest.mark.parametrize(
@@ -123,7 +122,7 @@ def test_photographs_that_show_nothing_are_named(taken, tmp_path, monkeypatch, c
     code, said, wrong = run(monkeypatch, capsys, "orient", *taken, blank, "--out", out)
     assert code == 0, wrong
     assert "7 of 8 images oriented" in said
-    assert "image wall[red] is not oriented: no features: blank or out of focus" in said
+    assert "not oriented: wall[red] (no features: blank or out of focus)" in said
     assert f"wrote {out}" in said
     summary = json.loads((out / "orientation.json").read_text())
     assert list(summary["unoriented"]) == ["wall[red]"]

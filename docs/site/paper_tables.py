@@ -11,7 +11,7 @@ from pathlib import Path
 
 import pandas as pd
 
-from jaxphoto.experiment.page import table_texts
+from jaxphoto.experiment.page import cell_words, heading, table_title
 
 PAGE = Path(__file__).resolve().parents[1] / "papers.md"
 KEPT = PAGE.parent / "papers" / "tables.csv"
@@ -49,18 +49,15 @@ def tables(cells: pd.DataFrame, paper: str) -> str:
 
 
 def _table(name: str, cells: pd.DataFrame) -> str:
-    texts = table_texts(name, cells)
-    rows = [["", *(column["heading"] for column in texts["columns"])], ["---"] * (len(texts["columns"]) + 1)]
-    rows += [[row["name"], *map(_cell, row["cells"])] for row in texts["rows"]]
-    lines = [f"**{texts['title']}**\n", *(f"| {' | '.join(row)} |" for row in rows), ""]
-    if difference := texts["difference"]:
-        lines += [f"Mean of |ours - printed|: {difference['words']}\n"]
-    return "\n".join(lines)
-
-
-def _cell(cell: dict) -> str:
-    printed = cell["published"].split(" (±")[0]
-    return f"**{cell['ours']}**<br>{printed}{' ✗' * (cell['within'] == 'no')}" if printed else ""
+    rows: dict[str, dict[str, str]] = {row: {} for row in cells["row"]}
+    for cell in cells.to_dict("records"):
+        ours, printed = cell_words(cell)
+        text = f"**{ours}**<br>{printed.split(' (')[0]}{' ✗' * (cell['within'] == 'no')}"
+        rows[cell["row"]][heading(cell["column"], cell["unit"])] = text if printed else ""
+    heads = list(dict.fromkeys(head for row in rows.values() for head in row))
+    lines = [["", *heads], ["---"] * (len(heads) + 1)]
+    lines += [[name, *(row.get(head, "") for head in heads)] for name, row in rows.items()]
+    return "\n".join([f"**{table_title(name)}**\n", *(f"| {' | '.join(line)} |" for line in lines), ""])
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from jaxphoto import adjust, simulate
 from jaxphoto.io import recipe_from
-from jaxphoto.report.draws import posterior_figure, posterior_table
+from jaxphoto.report.draws import posterior_table
 from jaxphoto.sensitivity.posterior import posterior
 
 RECIPE = Path(__file__).with_name("recipe.toml")
@@ -29,7 +29,6 @@ def main(folder: Path, draws: int) -> None:
         found = posterior(adjust(simulate(recipe_from(recipe), seed=1).block), PARAMETERS, draws=draws)
         table = posterior_table(found)
         table.to_csv(folder / f"{name}.csv", index=False)
-        posterior_figure(found).savefig(folder / f"{name}.png")
         print(f"{name}: {found.divergences.sum()} divergences, {found.gradients} gradients")
         print(table.round(4).to_string(index=False))
 

@@ -120,7 +120,9 @@ def run_experiment(
         try:
             for name, simulation in variants.items():
                 progress(f"adjusting: block {next(counter)} of {len(simulations) * len(variants)}")
-                adjusted[name] = _adjusted(simulation.block, sizes[name])
+                adjusted[name] = Tables(adjust(simulation.block, sizes=sizes[name]))
+                if not bool(adjusted[name].adjusted.converged):
+                    raise InputError(adjusted[name].adjusted.outcome.value)
         except JaxphotoError as error:
             failures.append(f"layout {layout}, {name}: {error}")
             continue
@@ -162,26 +164,16 @@ def _sizes(layouts: list[dict[str, Block]]) -> dict[str, PaddedSizes]:
     return {name: sizes[len(block.images)] for name, block in layouts[0].items()} if layouts else {}
 
 
-def _adjusted(block: Block, sizes: PaddedSizes) -> Tables:
-    adjusted = adjust(block, sizes=sizes)
-    if not bool(adjusted.converged):
-        raise InputError(adjusted.outcome.value)
-    return Tables(adjusted)
-
-
 def _recipe(variant: Variant, folder: Path) -> Recipe:
+    def merged(values: Any, changes: Any) -> Any:
+        if not isinstance(values, Mapping) or not isinstance(changes, Mapping):
+            return changes
+        return {**values, **{key: merged(values.get(key, {}), change) for key, change in changes.items()}}
+
     path = folder / variant.file
     if not path.is_file():
         raise InputError(f"recipe not found: {path}; add it, or correct the variant's file")
-    values = read_toml(path)
-    return recipe_from(_merged(values, variant.recipe), f"{folder.name}/{variant.file}")
-
-
-def _merged(values: Any, changes: Any) -> Any:
-    """Merge `changes` into nested tables."""
-    if not isinstance(values, Mapping) or not isinstance(changes, Mapping):
-        return changes
-    return {**values, **{key: _merged(values.get(key, {}), change) for key, change in changes.items()}}
+    return recipe_from(merged(read_toml(path), variant.recipe), f"{folder.name}/{variant.file}")
 
 
 def summary(cells: pd.DataFrame) -> pd.DataFrame:
@@ -207,9 +199,8 @@ def read_published(folder: Path) -> pd.DataFrame:
     table = pd.read_csv(path, dtype={"row": str, "column": str, "note": str}, keep_default_na=False, na_values=[""])
     if missing := [name for name in PUBLISHED if name not in table.columns]:
         raise InputError(f"{path}: the column {missing[0]} is missing; add it ({', '.join(PUBLISHED)} are needed)")
-    if table.duplicated(_KEY).any():
-        first = table[table.duplicated(_KEY)].iloc[0]
-        raise InputError(f"{path}: {first['table']}, {first['row']}, {first['column']} is printed twice; keep one row")
+    for first in table[table.duplicated(_KEY)][_KEY].itertuples(index=False):
+        raise InputError(f"{path}: {', '.join(first)} is printed twice; keep one row")
     return table
 
 
@@ -222,7 +213,9 @@ def compare(run: Run, folder: Path) -> pd.DataFrame:
     table = published.merge(summary(run.cells), on=_KEY, how="left")
     ours = summary(run.cells).merge(published[_KEY], on=_KEY, how="left", indicator=True)
     table = pd.concat([table, ours[ours["_merge"] == "left_only"].drop(columns="_merge")], ignore_index=True)
-    table = _with_mean_differences(table)
+    for k in table.index[table["column"] == MEAN_DIFFERENCE]:
+        cells = table[(table["table"] == table.loc[k, "table"]) & (table.index != k)]
+        table.loc[k, "ours"] = (cells["ours"] - cells["published"]).abs().mean()
     judged = table["published"].notna() & table["ours"].notna() & table["tolerance"].notna()
     inside = (table["ours"] - table["published"]).abs() <= table["tolerance"]
     table["within"] = np.where(judged, np.where(inside, "yes", "no"), "")
@@ -241,21 +234,9 @@ def side_by_side(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
     if cells.empty:
         names = ", ".join(dict.fromkeys(comparison["table"]))
         raise ValueError(f"{table!r} is not a table of this experiment; its tables are {names}")
-    of = cells.set_index(["row", "column"])
+    wide = cells.pivot_table(["published", "ours"], "row", "column", aggfunc="first", sort=False).swaplevel(axis=1)
     columns = pd.MultiIndex.from_product([dict.fromkeys(cells["column"]), ["published", "ours"]])
-    wide = pd.DataFrame(index=pd.Index(list(dict.fromkeys(cells["row"])), name="row"), columns=columns, dtype=float)
-    for row, column in of.index:
-        wide.loc[row, column] = of.loc[(row, column), ["published", "ours"]].to_numpy()
-    return wide.dropna(axis="columns", how="all")
-
-
-def _with_mean_differences(table: pd.DataFrame) -> pd.DataFrame:
-    """Fill in the cells of MEAN_DIFFERENCE."""
-    table = table.copy()
-    for k in table.index[table["column"] == MEAN_DIFFERENCE]:
-        cells = table[(table["table"] == table.loc[k, "table"]) & (table.index != k)]
-        table.loc[k, "ours"] = (cells["ours"] - cells["published"]).abs().mean()
-    return table
+    return wide.reindex(columns=columns, index=pd.Index(cells["row"].unique(), name="row")).dropna(axis=1, how="all")
 
 
 def find_experiments(directory: Path, name: str) -> list[Path]:

@@ -63,19 +63,18 @@ def residuals(rows: Rows, *, image: str = "mm", ground: str = "m") -> Measure:
 
     Tables 000 T3 and 004 T4. The papers call the variance factor sigma0. `image` is mm or px, `ground` m or mm.
     """
-    names = {"image_points": "rmse_{}_" + image, "control_points": "rmse_{}_" + ground}
-    names["stations"] = "rmse_{}s_" + ground
+    names = {
+        "image_points": "rmse_{}_" + image,
+        "control_points": "rmse_{}_" + ground,
+        "stations": "rmse_{}s_" + ground,
+    }
 
     def columns(tables: Tables) -> dict[str, float]:
-        adjusted = tables.adjusted
-        pixel = next(iter(adjusted.block.sensors.values())).pixel_mm
+        pixel = next(iter(tables.adjusted.block.sensors.values())).pixel_mm
         factors = {"mm": 1 / pixel if image == "px" else 1.0, "m": 1000.0 if ground == "mm" else 1.0}
-        rmse = {
-            names[spread.group].format(spread.axis): spread.rmse * factors[spread.unit]
-            for spread in residual_spread(adjusted)
-            if spread.group in names
-        }
-        return rmse | {"sigma0": float(adjusted.sigma0) ** 2}
+        spreads = (s for s in residual_spread(tables.adjusted) if s.group in names)
+        rmse = {names[s.group].format(s.axis): s.rmse * factors[s.unit] for s in spreads}
+        return rmse | {"sigma0": float(tables.adjusted.sigma0) ** 2}
 
     return _by_row(rows, columns)
 
@@ -147,16 +146,13 @@ def misalignment_agreement(pairs: Mapping[str, tuple[str, str]]) -> Measure:
 
     Maps each row to its pair of variants.
     """
-
-    def measure(results: Results) -> Cells:
-        cells: Cells = {}
-        for row, (first, second) in pairs.items():
-            one, two = boresight(results[first]), boresight(results[second])
-            for name, (value, sigma) in one.items():
-                cells[row, f"{name}_over_sigma"] = abs(value - two[name][0]) / np.hypot(sigma, two[name][1])
-        return cells
-
-    return measure
+    return lambda results: {
+        (row, f"{name}_over_sigma"): abs(one - two) / np.hypot(sigma, other)
+        for row, pair in pairs.items()
+        for (name, (one, sigma)), (two, other) in zip(
+            boresight(results[pair[0]]).items(), boresight(results[pair[1]]).values(), strict=True
+        )
+    }
 
 
 def boresight_correlation(rows: Rows) -> Measure:
@@ -164,9 +160,9 @@ def boresight_correlation(rows: Rows) -> Measure:
 
     def columns(tables: Tables) -> dict[str, float]:
         names = [label.split("].")[1] for label in tables.covariance.labels]
-        a, b = names.index("boresight_x_rad"), names.index("yp_mm")
-        matrix = np.asarray(tables.covariance.matrix)
-        return {"rho(domega,yp)": matrix[a, b] / np.sqrt(matrix[a, a] * matrix[b, b])}
+        k = [names.index("boresight_x_rad"), names.index("yp_mm")]
+        matrix = np.asarray(tables.covariance.matrix)[np.ix_(k, k)]
+        return {"rho(domega,yp)": matrix[0, 1] / np.sqrt(matrix[0, 0] * matrix[1, 1])}
 
     return _by_row(rows, columns)
 
@@ -195,10 +191,8 @@ def effects(rows: Rows, reference: str) -> Measure:
     """Compute the interior orientation relative to the variant `reference`, RMSE at check points and sigma naught."""
 
     def measure(results: Results) -> Cells:
-        cells: Cells = {}
-        expected = _interior(results[reference])
-        for row, variant in rows.items():
-            tables = results[variant]
+        expected, cells = _interior(results[reference]), Cells()
+        for row, tables in ((row, results[variant]) for row, variant in rows.items()):
             cells |= {(row, f"change_{c}"): value - expected[c] for c, value in _interior(tables).items()}
             cells |= {(row, c): value for c, value in _discrepancies(tables).items() if c.startswith("rmse_")}
             cells[row, "sigma0"] = float(tables.adjusted.sigma0)

@@ -15,34 +15,19 @@ import pandas as pd
 from jaxphoto.block import Block
 from jaxphoto.io.draws_folder import DrawsFolder, digest_of
 from jaxphoto.io.text_files import read_json
-from jaxphoto.report.draws import (
-    LONG,
-    Moments,
-    column_of,
-    draws_figure,
-    draws_table,
-    effects_figure,
-    in_degrees,
-    moments,
-    summary_table,
-)
+from jaxphoto.report.draws import draws_table, in_degrees, summary_table
 from jaxphoto.report.page import versions
 from jaxphoto.sensitivity import Bias, Readjustment, join_draws
 from jaxphoto.writing import whole_file
 
 # Maximum size of a part in draws, components and image rows: an interrupted run loses one part (some seconds).
 _PART, _PART_NUMBERS, _PART_ROWS = 1000, 5_000_000, 12_000_000
-# Minimum number of draws for an intermediate summary. Minimum drawing time (s) between summaries, and minimum ratio of
-# the drawing time to the duration of the last summary.
-_FIRST_DRAWS, _SECONDS, _TIMES = 100, 10.0, 20
 # Number of columns of the draws that are read at a time.
 _AT_ONCE = 200
-# Required keys of a summary, required columns of its table, and columns of the draws that are not quantities.
-_NUMBERS = ("draws", "converged", "fallbacks", "draws_per_second")
-_COLUMNS = {"quantity", "unit", "nominal", "mean", "sd", "predicted_sigma", "ratio"}
+# Columns of the draws that are not quantities.
 _OF_DRAWS = ("draw", "converged", "iterations", "fallback")
-# Maximum number of errors whose individual effects are predicted; maximum number of errors in a figure.
-_PREDICTED, _PICTURED = 20_000, 60
+# Maximum number of errors whose individual effects are predicted.
+_PREDICTED = 20_000
 
 
 class MonteCarlo:
@@ -72,29 +57,17 @@ class MonteCarlo:
 
         Raises InputError if another process draws into the folder.
         """
-        with self.folder.alone():
-            self._draw(progress)
-
-    def _draw(self, progress: Callable[[int], object]) -> None:
         folder = self.folder
-        if folder.done:
+        with folder.alone():
+            if not folder.done:
+                each = np.arange(folder.per_part)
+                self.run.warm_up(np.asarray(self.keys(each)))
+                for part in range(folder.next_part, folder.n_parts):
+                    began = time.perf_counter()
+                    self._draw_part(part, part * folder.per_part + each, progress)
+                    self.seconds += time.perf_counter() - began
+                folder.join()
             folder.tidy()
-            return
-        each = np.arange(folder.per_part)
-        self.run.warm_up(np.asarray(self.keys(each)))
-        since, pause = 0.0, _SECONDS
-        for part in range(folder.next_part, folder.n_parts):
-            began = time.perf_counter()
-            self._draw_part(part, part * folder.per_part + each, progress)
-            took = time.perf_counter() - began
-            self.seconds, since = self.seconds + took, since + took
-            done = (part + 1) * folder.per_part
-            if since >= pause and _FIRST_DRAWS <= done < folder.draws:
-                began = time.perf_counter()
-                self._sum_up(self._shared_columns)
-                since, pause = 0.0, max(_SECONDS, _TIMES * (time.perf_counter() - began))
-        folder.join()
-        folder.tidy()
 
     def _draw_part(self, part: int, numbers: np.ndarray, progress: Callable[[int], object]) -> None:
         """Compute the requested draws of `numbers`. Its length is constant, so one program is compiled."""
@@ -109,62 +82,26 @@ class MonteCarlo:
         self.computed += len(errors)
 
     def write(self) -> tuple[dict, pd.DataFrame]:
-        """Write summary.csv, effects.csv, figures and, last, summary.json; return the summary and its table.
+        """Write summary.csv, effects.csv and, last, summary.json; return the summary and its table.
 
         Existing files are read if nothing was drawn since they were written.
         """
-        if self.computed == 0 and (written := self._written()) is not None:
-            return written
-        return self._sum_up([c for c in self.folder.columns() if c not in _OF_DRAWS])
-
-    def _written(self) -> tuple[dict, pd.DataFrame] | None:
-        """Return the summary and table of all draws on disk; None if they are incomplete."""
-        directory = self.folder.directory
-        try:
-            summary, table = read_json(directory / "summary.json"), pd.read_csv(directory / "summary.csv")
-            table = table.fillna({"unit": ""})
-        except (ValueError, OSError):
-            return None
-        # Reject an intermediate summary.
-        numbers = all(isinstance(summary.get(key), int | float) for key in _NUMBERS)
-        columns = {"quantity", "unit", *table.select_dtypes("number").columns} & set(table.columns)
-        whole = numbers and summary["draws"] == self.folder.draws and columns >= _COLUMNS
-        return (summary, table) if whole else None
-
-    @property
-    def _shared_columns(self) -> list[str]:
-        """Return the columns of errors and shared parameters, which an intermediate summary uses."""
-        errors = [in_degrees(f"bias.{name}") for name in self.drawn.names] if self.drawn.recorded else []
-        return errors + [column_of(label) for label in self.run.adjusted.structure.labels]
-
-    def _sum_up(self, names: list[str]) -> tuple[dict, pd.DataFrame]:
-        """Write summary, effects and figures of the given columns."""
         directory, folder = self.folder.directory, self.folder
+        if self.computed == 0 and (directory / "summary.json").is_file():
+            return read_json(directory / "summary.json"), pd.read_csv(directory / "summary.csv").fillna({"unit": ""})
         nominal, effects, predicted = self._prediction
-        flags = folder.read(["converged", "fallback"])
-        good = flags["converged"]
+        flags, names = folder.read(["converged", "fallback"]), [c for c in folder.columns() if c not in _OF_DRAWS]
+        good, cameras = flags["converged"], self.run.adjusted.unknowns.interior
         predicted = predicted | {in_degrees(f"bias.{name}"): v for name, v in self._sigmas().items()}
-        statistics: dict[str, Moments] = {}
-        for first in range(0, len(names), _AT_ONCE):
-            some = folder.read(names[first : first + _AT_ONCE])
-            statistics |= {name: moments(values[good]) for name, values in some.items()}
-        table = summary_table(statistics, nominal, predicted, self.run.adjusted.unknowns.interior)
+        some = (pd.DataFrame(folder.read(names[k : k + _AT_ONCE]))[good] for k in range(0, len(names), _AT_ONCE))
+        table = pd.concat([summary_table(c, nominal, predicted, cameras) for c in some], ignore_index=True)
         with whole_file(directory / "summary.csv") as work:
             table.to_csv(work, index=False)
         if len(effects):
             with whole_file(directory / "effects.csv") as work:
                 effects.to_csv(work, index=False)
-        every = map(column_of, self.run.adjusted.structure.labels)
-        shared = [name for name in every if not name.startswith(LONG)]
-        if shared:
-            pictured = {name: values[good] for name, values in folder.read(shared).items()}
-            with whole_file(directory / "interior.png") as work:
-                draws_figure(pictured, table).savefig(work)
-        if shared and 0 < len(effects) <= _PICTURED:
-            with whole_file(directory / "effects.png") as work:
-                effects_figure(effects, table, shared).savefig(work)
         summary = {
-            "title": self.title, "draws": len(good), "draws_asked_for": folder.draws, "converged": int(good.sum()),
+            "title": self.title, "draws": len(good), "converged": int(good.sum()),
             "fallbacks": int(flags["fallback"].sum()), "computed_now": self.computed,
             "seconds": {"compile": self.run.seconds["compile"], "draws": self.seconds},
             "draws_per_second": self.computed / self.seconds if self.seconds else 0.0, "versions": versions(),

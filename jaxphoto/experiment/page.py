@@ -2,10 +2,7 @@
 
 from __future__ import annotations
 
-import math
-import re
-from collections.abc import Iterable, Iterator, Mapping
-from decimal import Decimal
+from collections.abc import Mapping
 from functools import partial
 from pathlib import Path
 from types import MappingProxyType
@@ -13,142 +10,95 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from jinja2 import Environment, PackageLoader
 from markupsafe import Markup
 
-from jaxphoto.experiment.experiment import MEAN_DIFFERENCE, Run, compare
-from jaxphoto.report import check_points_figure, new_figure, plot_block
-from jaxphoto.report.block_plot import block_words
+from jaxphoto.experiment.experiment import Run, compare
+from jaxphoto.report.block_plot import block_words, plot_block
+from jaxphoto.report.formatting import head_of, plus_minus, without_unit
 from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot, page, provenance
-from jaxphoto.report.plots import axes_or_new
+from jaxphoto.report.plots import axes_or_new, check_points_figure, new_figure, title
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_AGREEMENT = (
-    "Ours minus printed over the tolerance promised, by table: within it between the lines at -1 and 1, crosses beyond"
+_LEGEND = (
+    "In each cell, above: ours, the mean over {layouts} simulated layouts +- the standard deviation from layout to "
+    "layout. Below: what is printed (+- the tolerance promised). Green: within the tolerance; red and a cross: not; no "
+    "colour: nothing promised."
 )
-_STYLE = """\
-:root { --width: 72rem } .as-printed :is(td, th) { white-space: nowrap; line-height: 1.3; padding: .2rem .35rem }
-.as-printed th:not([aria-sort]) button::after { content: "" }
-.as-printed th { font-weight: 600 }
-.no { background: var(--red) } .yes { background: var(--green) } .chip { padding: 0 .5em; border-radius: 3px }
-.yes, .no { print-color-adjust: exact } .no::before { content: "\\2717\\a0"; color: var(--bad) }
-.ours { font-weight: 600 } .spread, .paper { color: var(--grey) } .spread { font-size: 90% }
-ol.notes { margin: 0 0 1.5rem; font-size: 13px; color: var(--grey) } sup { color: var(--grey); font-size: 75% }
-@media print { ol.notes { break-before: avoid; font-size: 9px } .as-printed :is(td + td, th) { white-space: normal } }
-"""
-_LEGEND = Markup(
-    '<p>In each cell, above: <span class="ours">ours</span>, the mean over {}{}. Below: <span class="paper">what is '
-    'printed (± the tolerance promised)</span>. <span class="chip yes">green</span> within the tolerance, <span '
-    'class="chip no">red</span> and a cross not, no colour: nothing promised. Small numbers at cells and headings refer '
-    "to the notes below the table. Tables sort by what is ours.</p>"
-)
-_SPREAD = Markup(', <span class="spread">± the standard deviation from layout to layout</span>')
-_TABLE = Environment(loader=PackageLoader("jaxphoto.experiment"), autoescape=True).get_template("printed_table.html")
+_CELL = Markup('<span class="{}">{}{}</span><br>{}')
+_ACROSS = 5
 
 
 def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
     """Return a page with links to the pages of several experiments. Input: title and comparison by name."""
-    parts: list[Part] = []
-    for name, (title, t) in experiments.items():
-        good, judged = int((t["within"] == "yes").sum()), int((t["within"] != "").sum())
-        parts.append(Link(f"{title}: {good} of {judged} printed values with a tolerance are within it", f"{name}.html"))
-    return page("Experiments", parts)
+    return page("Experiments", [Link(f"{name}: {agreement(t)}", f"{k}.html") for k, (name, t) in experiments.items()])
+
+
+def agreement(comparison: pd.DataFrame) -> str:
+    """Summarise the number of printed values within their tolerance, and of those without tolerance."""
+    good, judged = (int((comparison["within"].isin(words)).sum()) for words in (["yes"], ["yes", "no"]))
+    n = int(comparison["published"].notna().sum())
+    if not judged:
+        return "no printed value has a tolerance"
+    without = f"; {n - judged} of {n} printed values have no tolerance" if n > judged else ""
+    return f"{good} of {judged} printed values with a tolerance are within it{without}"
 
 
 def experiment_page(run: Run, comparison: pd.DataFrame, record: CommandRecord | None = None) -> str:
     """Return the HTML page: agreement, the block of the first layout, each table, check points."""
-    tables = [table_texts(str(name), cells) for name, cells in comparison.groupby("table", sort=False)]
-    judged, good = (sum(table[name] for table in tables) for name in ("judged", "good"))
-    verdict = f"{good} of {judged} printed values with a tolerance are within it"
-    n = int(comparison["published"].notna().sum())
-    verdict += f"; {n - judged} of {n} printed values have no tolerance" if n > judged else ""
-    if not judged:
-        verdict = "no printed value has a tolerance"
-    colour = "" if not judged else "green" if good == judged else "amber"
-    parts = [*_parts(run, comparison, tables), *(provenance(record) if record else ())]
-    return page(run.experiment.title, parts, (verdict, colour), _STYLE)
-
-
-def _parts(run: Run, comparison: pd.DataFrame, tables: list[dict]) -> Iterator[Part]:
-    yield from (Paragraph(f"skipped: {failure}", "warning") for failure in run.failures)
-    yield Heading("Within the tolerances")
-    counts = [(t["title"], t["good"], t["judged"]) for t in tables]
-    yield pd.DataFrame(counts, columns=["table", "within", "values with a tolerance"])
-    if any(table["judged"] for table in tables):
-        yield [Plot(partial(draw_agreement, comparison=comparison), _AGREEMENT, 3.6)]
-    first = next(iter(run.first.values()))
-    yield Heading("Block of the first layout")
-    yield [Plot(lambda ax: plot_block(first.adjusted, ax), block_words(first.adjusted.block), 4.2)]
-    layouts = run.cells["layout"].nunique()
-    many = layouts > 1
-    yield Heading("Tables")
-    yield _LEGEND.format(f"{layouts} simulated layout{'s' * many}", _SPREAD if many else "")
-    for table in tables:
-        yield Heading(table["title"])
-        yield Markup(_TABLE.render(table))
+    judged, first = comparison[comparison["within"] != ""], next(iter(run.first.values()))
+    colour = "" if judged.empty else "amber" if (judged["within"] == "no").any() else "green"
+    parts: list[Part] = [Paragraph(f"skipped: {failure}", "warning") for failure in run.failures]
+    if len(judged):
+        words = "Ours minus printed over the tolerance, by table: within it between the lines, crosses beyond"
+        parts += [Heading("Within the tolerances"), [Plot(partial(plot_agreement, comparison), words, 3.6)]]
+    parts += [Heading("Block of the first layout")]
+    parts += [[Plot(partial(plot_block, first.adjusted), block_words(first.adjusted.block), 4.2)]]
+    parts += [Heading("Tables"), Paragraph(_LEGEND.format(layouts=run.cells["layout"].nunique()))]
+    for name, cells in comparison.groupby("table", sort=False):
+        parts += [Heading(table_title(str(name))), printed_table(cells)]
+        notes = cells[cells["note"] != ""].groupby("note", sort=False)["column"].unique()
+        parts += [Paragraph(f"{', '.join(map(head_of, columns))}: {note}") for note, columns in notes.items()]
     if check := {name: of for name, of in run.first.items() if len(of.check_points)}:
-        yield Heading("Check points of the first layout")
-        yield Plot(check_points_figure(check), "discrepancies at check points, in plan and in height")
+        parts += [Heading("Check points of the first layout")]
+        parts += [Plot(check_points_figure(check), "discrepancies at check points, in plan and in height")]
+    parts += provenance(record) if record else []
+    return page(run.experiment.title, parts, (agreement(comparison), colour))
 
 
-def table_texts(name: str, cells: pd.DataFrame) -> dict:
-    """Format a table: title, columns, rows, notes, and the number of cells within their tolerance."""
-    overall = cells["column"] == MEAN_DIFFERENCE
-    shown = cells[~overall]
-    # Put notes of a whole column at its heading, other notes at their cells; number them in order.
-    numbers: dict[str, int] = {}
-    columns: list[dict] = []
-    texts: dict[tuple, dict] = {}
-    for column, of in shown.groupby("column", sort=False):
-        notes = [note for note in of["note"].unique() if note]
-        whole = [note for note in notes if (of["note"] == note).all()]
-        for note in notes:
-            numbers.setdefault(note, len(numbers) + 1)
-        power = power_of(np.concatenate([of["ours"].dropna(), of["published"].dropna()]))
-        unit = next((u for u in of["unit"] if isinstance(u, str)), "")
-        columns.append({"heading": heading(str(column), unit, power), "notes": [numbers[note] for note in whole]})
-        marks = {note: numbers[note] for note in notes if note not in whole}
-        texts |= {(cell["row"], column): text for cell, text in _column(of, power, marks)}
-    empty = {"ours": "", "spread": "", "published": "", "within": "", "note": ""}
-    names = list(dict.fromkeys(shown["column"]))
-    rows = [{"name": r, "cells": [texts.get((r, c), empty) for c in names]} for r in dict.fromkeys(shown["row"])]
-    return {
-        "name": name, "title": table_title(name), "judged": int((cells["within"] != "").sum()),
-        "good": int((cells["within"] == "yes").sum()), "columns": columns, "rows": rows,
-        "printed": bool(shown["published"].notna().any()), "notes": list(numbers),
-        "difference": _difference(cells[overall].iloc[0]) if overall.any() else None,
-    }  # fmt: skip
+def printed_table(cells: pd.DataFrame) -> pd.DataFrame:
+    """Return one table in the layout of the paper, as text: ours above the published value of each cell."""
+    rows: dict[str, dict[str, str]] = {str(row): {} for row in cells["row"]}
+    for cell in cells.to_dict("records"):
+        ours, printed = cell_words(cell)
+        mark = " ✗" if cell["within"] == "no" else ""
+        head = heading(str(cell["column"]), cell["unit"])
+        rows[str(cell["row"])][head] = _CELL.format(cell["within"], ours, mark, printed)
+    return pd.DataFrame(rows.values(), index=list(rows)).fillna("").reset_index(names="row")
 
 
-def _column(of: pd.DataFrame, power: int, marks: dict[str, int]) -> list[tuple[pd.Series, dict]]:
-    """Format every cell of one column with the decimals of the column."""
-    scale = 10.0**-power
-    printed = printed_decimals(of["published"].dropna(), power)
-    size = scale * float(of["ours"].abs().max())
-    column = []
-    for _, cell in of.iterrows():
-        spread = scale * float(cell["spread"]) if pd.notna(cell["spread"]) else 0.0
-        ours, paper = scale * float(cell["ours"]), scale * float(cell["published"])
-        digits = own_decimals(ours, spread, printed, size) if pd.notna(ours) else 0
-        tolerance = f" (± {scale * cell['tolerance']:.2g})" if pd.notna(cell["tolerance"]) else ""
-        text = {
-            "ours": f"{ours:z.{digits}f}" if pd.notna(ours) else "",
-            "spread": f" ± {spread:.{digits}f}" if round(spread, digits) else "",
-            "published": f"{paper:.{printed or 0}f}{tolerance}" if pd.notna(paper) else "",
-            "within": cell["within"],
-            "note": marks.get(cell["note"], ""),
-        }
-        column.append((cell, text))
-    return column
+def cell_words(cell: Mapping[Any, Any]) -> tuple[str, str]:
+    """Format the computed and the published value of a cell; "" if missing."""
+    ours, spread, published, tolerance = (float(cell[k]) for k in ("ours", "spread", "published", "tolerance"))
+    computed = plus_minus(ours, spread) if spread > 0 else f"{ours:.6g}"
+    promised = f" (+- {tolerance:.2g})" if np.isfinite(tolerance) else ""
+    return computed if np.isfinite(ours) else "", f"{published:g}{promised}" if np.isfinite(published) else ""
 
 
-def _difference(cell: pd.Series) -> dict[str, str]:
-    promised = f" (at most {cell['tolerance']:g} promised)" if pd.notna(cell["tolerance"]) else ""
-    return {"words": f"{cell['ours']:.3g}{promised}", "within": cell["within"]}
+def heading(column: str, unit: Any) -> str:
+    """Return the label of a column with its unit."""
+    return head_of(column) if without_unit(column)[1] or not isinstance(unit, str) else f"{head_of(column)} [{unit}]"
+
+
+def table_title(name: str) -> str:
+    """`table2_iops` -> `Table 2: iops`; `agreement` -> `Agreement`."""
+    number, _, words = name.partition("_")
+    if number[:5] == "table" and number[5:].isdigit():
+        return f"Table {number[5:]}: {words.replace('_', ' ')}"
+    return name[:1].upper() + name[1:].replace("_", " ")
 
 
 def write_runs(
@@ -156,17 +106,12 @@ def write_runs(
 ) -> None:
     """Write tables.csv, cells.csv (every layout) and report.html of the `runs` of experiment folders into `out`.
 
-    Several experiments get one page each, with report.html as index. `record` is the provenance of each run. Raises the
-    errors of `whole_folder`.
+    Several experiments get one page each, with report.html as index. `record` is the provenance of each run.
     """
     tables = {folder: compare(run, folder) for folder, run in runs.items()}
-    only = len(runs) == 1
-    pages = {
-        "report.html" if only else f"{folder.name}.html": experiment_page(run, tables[folder], record.get(folder))
-        for folder, run in runs.items()
-    }
-    if not only:
-        pages["report.html"] = index_page({f.name: (run.experiment.title, tables[f]) for f, run in runs.items()})
+    pages = {f"{f.name}.html": experiment_page(run, tables[f], record.get(f)) for f, run in runs.items()}
+    index = index_page({folder.name: (run.experiment.title, tables[folder]) for folder, run in runs.items()})
+    pages = pages | {"report.html": index} if len(runs) > 1 else {"report.html": next(iter(pages.values()))}
     cells = [run.cells.assign(experiment=folder.name) for folder, run in runs.items()]
     with whole_folder(out) as work:
         pd.concat(tables.values(), ignore_index=True).to_csv(work / "tables.csv", index=False)
@@ -175,74 +120,7 @@ def write_runs(
             (work / name).write_text(content, encoding="utf-8")
 
 
-# Labels ----------------------------------------------------------------------------------------------------
-
-_WORDS = {
-    "iops": "IOPs", "gcp": "GCP", "abs": "absolute", "rmse": "RMSE", "n": "number of", "sigma": "σ",
-    "omega": "ω", "phi": "φ", "kappa": "κ", "domega": "dω", "dphi": "dφ", "dkappa": "dκ",
-}  # fmt: skip
-_UNITS = {"mm", "m", "px", "um", "deg", "arcsec", "mm-1", "mm-2", "mm-4", "mm-6"}
-_SMALL = 1e-3
-"""Columns whose values are all smaller are scaled by a power of ten."""
-
-
-def table_title(name: str) -> str:
-    """`table2_iops` -> `Table 2: IOPs`; `agreement` -> `Agreement`."""
-    numbered = re.fullmatch(r"table(\d+)_(.+)", name)
-    if numbered:
-        return f"Table {numbered[1]}: {_words(numbered[2])}"
-    return _words(name)[:1].upper() + _words(name)[1:]
-
-
-def heading(column: str, unit: str, power: int) -> str:
-    """Return the label of a column, with the unit of its name, else `unit`; values are scaled by 10**`power`."""
-    stem, _, last = column.rpartition("_")
-    named = last in _UNITS and bool(stem)
-    of = (last if named else unit).replace("um", "µm")
-    of = re.sub(r"\^?-(\d)", lambda m: _raised(-int(m[1])), of)
-    scale = f"10{_raised(power)}" if power else ""
-    inside = " ".join(word for word in (scale, of) if word)
-    return _words(stem if named else column) + (f" [{inside}]" if inside else "")
-
-
-def power_of(values: Iterable[float]) -> int:
-    """Return the power of ten of a column of small values, 0 for other columns."""
-    largest = max((abs(v) for v in values), default=0.0)
-    return math.floor(math.log10(largest)) if 0 < largest < _SMALL else 0
-
-
-def printed_decimals(values: Iterable[float], power: int) -> int | None:
-    """Return the number of decimals that represents all `values` (in 10**`power`) exactly; None if all are zero."""
-    places = [-int(Decimal(repr(float(v))).normalize().as_tuple().exponent) + power for v in values if v]
-    return max([0, *places]) if places else None
-
-
-def own_decimals(value: float, spread: float, printed: int | None, size: float) -> int:
-    """Return the number of decimals of a computed value: two significant digits of its spread.
-
-    It is at least `printed` and at most one more. Without published value and spread: three significant digits of
-    `size`. Counts have none.
-    """
-    if value == round(value) and not spread > 0:
-        return 0
-    of_spread = 1 - math.floor(math.log10(spread)) if spread > 0 else None
-    if printed is not None:
-        return min(max(printed, of_spread if of_spread is not None else printed + 1), printed + 1)
-    of_size = 2 - math.floor(math.log10(abs(size))) if size else 0
-    return max(0, of_spread if of_spread is not None else of_size)
-
-
-def _words(name: str) -> str:
-    return " ".join(_WORDS.get(word, word) for word in name.split("_"))
-
-
-def _raised(power: int) -> str:
-    return str(power).translate(str.maketrans("-0123456789", "⁻⁰¹²³⁴⁵⁶⁷⁸⁹"))
-
-
-# Figures ---------------------------------------------------------------------------------------------------
-
-_ACROSS = 5
+# Figures ---------------------------------------------------------------------------------------------------------
 
 
 def plot_comparison(comparison: pd.DataFrame, table: str, column: str, ax: Axes | None = None) -> Axes:
@@ -252,73 +130,47 @@ def plot_comparison(comparison: pd.DataFrame, table: str, column: str, ax: Axes 
     of the computed value over the layouts. Raises ValueError if no cell of the column is both published and computed.
     """
     cells = _both(comparison, table)
-    of = cells[cells["column"] == column]
+    of, rows = cells[cells["column"] == column], list(dict.fromkeys(cells["row"]))
     if of.empty:
         known = ", ".join(dict.fromkeys(cells["column"]))
         raise ValueError(
             f"{table!r}: column {column!r} has no printed value with a result of ours; choose among {known}"
         )
-    ax = axes_or_new(ax)
-    rows = list(dict.fromkeys(of["row"]))
-    _draw_column(ax, of, rows)
-    _name_rows(ax, rows)
-    ax.legend(fontsize=8)
+    ax, at = axes_or_new(ax), np.array([rows.index(row) for row in of["row"]])
+    bars: dict[str, Any] = {"capsize": 2, "lw": 1, "ls": "none"}
+    printed: dict[str, Any] = {"marker": "s", "ms": 5, "mfc": "none", "color": "0.45"}
+    ours: dict[str, Any] = {"marker": "o", "ms": 4}
+    ax.errorbar(of["published"], at - 0.15, xerr=of["tolerance"], label="printed ± tolerance", **printed, **bars)
+    ax.errorbar(of["ours"], at + 0.15, xerr=of["spread"], label="ours ± spread", **ours, **bars)
+    ax.set_title(heading(column, of["unit"].iloc[0]), fontsize=9)
+    ax.tick_params(labelsize=7)
+    ax.grid(axis="y", lw=0.3)
+    ax.locator_params(axis="x", nbins=4)
+    ax.set_yticks(range(len(rows)), rows, fontsize=8)
+    ax.set_ylim(len(rows) - 0.5, -0.5)
     return ax
 
 
 def comparison_figure(comparison: pd.DataFrame, table: str) -> Figure:
-    """Plot each published column of `table` in one panel, as in `plot_comparison`.
-
-    Raises ValueError if no cell of the table is both published and computed.
-    """
+    """Plot each published column of `table` in one panel, as in `plot_comparison`."""
     cells = _both(comparison, table)
-    rows = list(dict.fromkeys(cells["row"]))
-    groups = list(cells.groupby("column", sort=False))
-    down = -(-len(groups) // _ACROSS)
-    figure = new_figure(1.6 + 1.8 * min(len(groups), _ACROSS), down * (1.2 + 0.24 * len(rows)))
-    panels = figure.subplots(down, min(len(groups), _ACROSS), squeeze=False, sharey=True).ravel()
-    for axes, (_, of) in zip(panels, groups, strict=False):
-        _draw_column(axes, of, rows)
-    for axes in panels[len(groups) :]:
-        axes.set_axis_off()
-    _name_rows(panels[0], rows)
+    names = list(dict.fromkeys(cells["column"]))
+    down, across = -(-len(names) // _ACROSS), min(len(names), _ACROSS)
+    figure = new_figure(1.6 + 1.8 * across, down * (1.2 + 0.24 * cells["row"].nunique()))
+    for k, name in enumerate(names):
+        panel = plot_comparison(comparison, table, name, figure.add_subplot(down, across, k + 1))
+        panel.tick_params(labelleft=k % across == 0)
     figure.suptitle(table_title(table), fontsize=11)
-    figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
+    figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=2, fontsize=8)
     return figure
 
 
 def _both(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
     """Return the cells of a table that are both published and computed."""
-    cells = comparison[(comparison["table"] == table) & (comparison["column"] != MEAN_DIFFERENCE)]
-    cells = cells[cells["published"].notna() & cells["ours"].notna()]
+    cells = comparison[(comparison["table"] == table) & comparison["published"].notna() & comparison["ours"].notna()]
     if cells.empty:
         raise ValueError(f"{table!r}: no printed value has a result of ours")
     return cells
-
-
-def _draw_column(axes: Axes, of: pd.DataFrame, rows: list[str]) -> None:
-    power = power_of(np.concatenate([of["published"], of["ours"]]))
-    values = of[["published", "tolerance", "ours", "spread"]].astype(float) * 10.0**-power
-    at = np.array([rows.index(row) for row in of["row"]])
-    bars: dict[str, Any] = {"capsize": 2, "lw": 1, "ls": "none"}
-    axes.errorbar(
-        values["published"], at - 0.15, xerr=values["tolerance"], marker="s", ms=5, mfc="none",
-        color="0.45", label="printed ± tolerance", **bars,
-    )  # fmt: skip
-    axes.errorbar(
-        values["ours"], at + 0.15, xerr=values["spread"], marker="o", ms=4, color="tab:blue",
-        label="ours ± spread", **bars,
-    )  # fmt: skip
-    unit = next((u for u in of["unit"] if isinstance(u, str)), "")
-    axes.set_title(heading(str(of["column"].iloc[0]), unit, power), fontsize=9)
-    axes.tick_params(labelsize=7)
-    axes.grid(axis="y", lw=0.3)
-    axes.locator_params(axis="x", nbins=4)
-
-
-def _name_rows(axes: Axes, rows: list[str]) -> None:
-    axes.set_yticks(range(len(rows)), rows, fontsize=8)
-    axes.set_ylim(len(rows) - 0.5, -0.5)
 
 
 def plot_agreement(comparison: pd.DataFrame, ax: Axes | None = None) -> Axes:
@@ -326,28 +178,24 @@ def plot_agreement(comparison: pd.DataFrame, ax: Axes | None = None) -> Axes:
 
     Raises ValueError if no computed value has a tolerance.
     """
-    if not comparison["within"].ne("").any():
+    cells = comparison[comparison["within"] != ""]
+    if cells.empty:
         raise ValueError("no printed value with a result of ours has a tolerance")
     ax = axes_or_new(ax)
-    draw_agreement(ax, comparison)
-    return ax
-
-
-def draw_agreement(axes: Axes, comparison: pd.DataFrame) -> None:
-    """Draw `plot_agreement` in a panel."""
-    cells = comparison[comparison["within"] != ""]
     off = ((cells["ours"] - cells["published"]) / cells["tolerance"]).to_numpy(float)
-    tables = list(dict.fromkeys(cells["table"]))
-    place, number = pd.factorize(cells["table"])[0], cells.groupby("table").cumcount().to_numpy()
+    place, tables = pd.factorize(cells["table"])
+    number = cells.groupby("table").cumcount().to_numpy()
+    of = cells.groupby("table")["table"].transform("size").to_numpy()
     # Arrange the values of a table from top to bottom, in the order of the paper.
-    at = place + 0.7 * (number / np.maximum(cells.groupby("table")["table"].transform("size") - 1, 1) - 0.5)
+    at = place + 0.7 * (number / np.maximum(of - 1, 1) - 0.5)
     within = (cells["within"] == "yes").to_numpy()
-    axes.axvspan(-1, 1, color="0.93", lw=0)
+    ax.axvspan(-1, 1, color="0.93", lw=0)
     for rows, marker, colour, label in ((within, "o", "tab:blue", "within"), (~within, "x", "tab:red", "not within")):
         if rows.any():
-            axes.plot(off[rows], at[rows], marker, ms=5, mew=1.5, color=colour, label=label, ls="none")
-    axes.set_yticks(range(len(tables)), list(map(table_title, tables)), fontsize=8)
-    axes.set_ylim(len(tables) - 0.5, -0.5)
-    axes.set_xlabel("(ours - printed) / tolerance")
-    axes.set_title("all values with a tolerance", loc="left", fontsize=9)
-    axes.legend(fontsize=7)
+            ax.plot(off[rows], at[rows], marker, ms=5, mew=1.5, color=colour, label=label, ls="none")
+    ax.set_yticks(range(len(tables)), list(map(table_title, tables)), fontsize=8)
+    ax.set_ylim(len(tables) - 0.5, -0.5)
+    ax.set_xlabel("(ours - printed) / tolerance")
+    title(ax, "all values with a tolerance")
+    ax.legend(fontsize=7)
+    return ax

@@ -1,11 +1,10 @@
 """Tables, plots, the HTML report and the result folder of an adjustment."""
 
-from jaxphoto.report.block_plot import block_in_space, plot_block
+from jaxphoto.report.block_plot import plot_block
 from jaxphoto.report.boresight import plot_boresight, print_boresight, write_boresight
-from jaxphoto.report.distortion import plot_distortion, plot_distortion_band
-from jaxphoto.report.draws import correlation_cube, covariance_array, draws_cube, plot_draws, plot_effects
+from jaxphoto.report.draws import plot_draws, plot_effects
 from jaxphoto.report.findings import Finding, Verdict
-from jaxphoto.report.flight_plots import plot_photograph_residuals, plot_position_offsets, plot_time_line
+from jaxphoto.report.flight import plot_position_offsets
 from jaxphoto.report.formatting import TABLE_FORMATS, check_table_format, to_latex, to_markdown, write_table
 from jaxphoto.report.lidar import plot_above, plot_lidar_heights
 from jaxphoto.report.model_choice import plot_models
@@ -16,16 +15,15 @@ from jaxphoto.report.plots import (
     plot_check_points,
     plot_convergence,
     plot_density,
+    plot_distortion,
+    plot_distortion_band,
     plot_error_ellipses,
     plot_exterior_correlation,
     plot_interior_correlation,
     plot_intersection_angles,
-    plot_link_strength,
     plot_links,
     plot_mean_residuals,
     plot_overlap,
-    plot_point_sigmas,
-    plot_rays,
     plot_residuals,
     plot_residuals_by_radius,
     plot_sigma_map,
@@ -43,17 +41,16 @@ from jaxphoto.report.terminal import print_adjustment, print_components, print_w
 from jaxphoto.report.verdict import verdict_of
 
 __all__ = [
-    "TABLE_FORMATS", "Finding", "Tables", "Verdict", "block_in_space", "check_points_figure", "check_table_format",
-    "component_findings", "component_tables", "correlation_cube", "correlation_figure", "covariance_array",
-    "draws_cube", "left_out_table", "new_figure", "plot_above", "plot_block", "plot_boresight", "plot_change",
-    "plot_check_points", "plot_convergence", "plot_density", "plot_distortion", "plot_distortion_band", "plot_draws",
-    "plot_effects", "plot_error_ellipses", "plot_exterior_correlation", "plot_halves", "plot_interior_correlation",
-    "plot_intersection_angles", "plot_lidar_heights", "plot_link_strength", "plot_links", "plot_mean_residuals",
-    "plot_models", "plot_overlap", "plot_photograph_residuals", "plot_point_sigmas", "plot_position_offsets",
-    "plot_ray_offsets", "plot_rays", "plot_residuals", "plot_residuals_by_radius", "plot_scanner_correlation",
-    "plot_sensitivity", "plot_sigma_map", "plot_station_residuals", "plot_strip_differences", "plot_sweep",
-    "plot_time_line", "plot_trajectory_errors", "prepare_pictures", "print_adjustment", "print_boresight",
-    "print_components", "print_warning", "recovery_spread", "recovery_table", "report_page", "snooped_findings",
-    "summary_of", "to_latex", "to_markdown", "verdict_of", "write_boresight", "write_results", "write_table",
-    "write_tables",
+    "TABLE_FORMATS", "Finding", "Tables", "Verdict", "check_points_figure", "check_table_format",
+    "component_findings", "component_tables", "correlation_figure", "left_out_table", "new_figure", "plot_above",
+    "plot_block", "plot_boresight", "plot_change", "plot_check_points", "plot_convergence", "plot_density",
+    "plot_distortion", "plot_distortion_band", "plot_draws", "plot_effects", "plot_error_ellipses",
+    "plot_exterior_correlation", "plot_halves", "plot_interior_correlation", "plot_intersection_angles",
+    "plot_lidar_heights", "plot_links", "plot_mean_residuals", "plot_models", "plot_overlap",
+    "plot_position_offsets", "plot_ray_offsets", "plot_residuals", "plot_residuals_by_radius",
+    "plot_scanner_correlation", "plot_sensitivity", "plot_sigma_map", "plot_station_residuals",
+    "plot_strip_differences", "plot_sweep", "plot_trajectory_errors", "prepare_pictures", "print_adjustment",
+    "print_boresight", "print_components", "print_warning", "recovery_spread", "recovery_table", "report_page",
+    "snooped_findings", "summary_of", "to_latex", "to_markdown", "verdict_of", "write_boresight", "write_results",
+    "write_table", "write_tables",
 ]  # fmt: skip

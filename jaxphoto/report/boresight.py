@@ -4,28 +4,27 @@ from __future__ import annotations
 
 import math
 import re
-import time
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import pandas as pd
 from rich.console import Console
-from rich.text import Text
 
 from jaxphoto.errors import InputError
 from jaxphoto.procedures.boresight import Step
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot
-from jaxphoto.report.plots import axes_or_new, label, new_figure
+from jaxphoto.report.plots import axes_or_new, label
 from jaxphoto.report.results import rounded, write_results, write_study
 from jaxphoto.report.tables import Tables
+from jaxphoto.report.terminal import print_lines
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Length of error bars in standard deviations.
 _BARS = 2.0
@@ -57,17 +56,6 @@ def steps_table(steps: Sequence[Step]) -> pd.DataFrame:
         rows.append((step.number, "sigma0", sigma0, sigma0 / math.sqrt(2 * redundancy) if redundancy > 0 else None, ""))
         rows += [(step.number, *estimate) for estimate in step.estimates]
     return pd.DataFrame(rows, columns=["step", "parameter", "value", "sigma", "unit"])
-
-
-def boresight_figure(steps: Sequence[Step]) -> Figure | None:
-    """Draw misalignments of steps 3 and 4 and strip shifts of step 2 with error bars; None without estimates."""
-    sets = [shifts for shifts in (False, True) if len(_rows(steps, shifts))]
-    if not sets:
-        return None
-    figure = new_figure(4.8 * len(sets), 1.2 + 0.24 * max(len(_rows(steps, shifts)) for shifts in sets))
-    for axes, shifts in zip(figure.subplots(1, len(sets), squeeze=False).flat, sets, strict=True):
-        plot_boresight(steps, axes, shifts=shifts)
-    return figure
 
 
 def plot_boresight(steps: Sequence[Step], ax: Axes | None = None, *, shifts: bool = False) -> Axes:
@@ -111,11 +99,13 @@ def _short(path: str) -> str:
 
 def boresight_parts(steps: Sequence[Step]) -> list[Part]:
     """Return the parts of the page: misalignments, then findings and estimates of each step."""
-    parts: list[Part] = []
-    if figure := boresight_figure(steps):
-        parts.append(Heading("Misalignment and shifts"))
-        parts.append(Plot(figure, "misalignments and shifts of strips with error bars"))
-        parts.append(Paragraph(f"Bars are {_BARS:g} standard deviations to each side."))
+    names = {False: "misalignments", True: "shifts of strips"}
+    plots = [
+        Plot(partial(plot_boresight, steps, shifts=shifts), f"{name} with bars of {_BARS:g} standard deviations")
+        for shifts, name in names.items()
+        if len(_rows(steps, shifts))
+    ]
+    parts: list[Part] = [Heading("Misalignment and shifts"), plots] if plots else []
     for step in steps:
         parts.append(Heading(f"Step {step.number}: {step.title}"))
         parts += [Paragraph(as_sentence(finding)) for finding in step.findings]
@@ -127,32 +117,26 @@ def boresight_parts(steps: Sequence[Step]) -> list[Part]:
 
 
 def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, float], record: CommandRecord) -> None:
-    """Write steps.csv, summary.json, report.html and the result folders step_1 to step_4.
-
-    Raises InputError if `directory` contains anything but an earlier result.
-    """
-    began, passed = time.perf_counter(), all(step.go_on for step in steps)
-    block, verdict = steps[0].adjusted.block, boresight_verdict(steps)
+    """Write steps.csv, summary.json, report.html and the result folders step_1 to step_4."""
+    block, verdict, passed = steps[0].adjusted.block, boresight_verdict(steps), all(step.go_on for step in steps)
+    summary = {
+        "title": block.title, "verdict": verdict, "passed": passed,
+        "steps": [
+            {
+                "step": step.number, "title": step.title, "go_on": step.go_on,
+                "converged": bool(step.adjusted.converged), "sigma0": float(step.adjusted.sigma0),
+                "redundancy": step.adjusted.redundancy, "findings": list(step.findings),
+                "estimates": [estimate._asdict() for estimate in step.estimates],
+            }
+            for step in steps
+        ],
+        "seconds": rounded(seconds),
+    }  # fmt: skip
     with whole_folder(directory) as work:
         for step in steps:
             tables, times = Tables(step.adjusted), step.adjusted.seconds
             spent = {name: times[name] for name in ("compile", "solve", "covariance")}
             write_results(tables, verdict_of(tables), work / f"step_{step.number}", spent, record=record)
-        summary = {
-            "title": block.title,
-            "verdict": verdict,
-            "passed": passed,
-            "steps": [
-                {
-                    "step": step.number, "title": step.title, "go_on": step.go_on,
-                    "converged": bool(step.adjusted.converged), "sigma0": float(step.adjusted.sigma0),
-                    "redundancy": step.adjusted.redundancy, "findings": list(step.findings),
-                    "estimates": [estimate._asdict() for estimate in step.estimates],
-                }
-                for step in steps
-            ],
-            "seconds": rounded(seconds | {"write": time.perf_counter() - began}),
-        }  # fmt: skip
         write_study(
             work, f"{block.title or 'block'}: boresight", (verdict, "green" if passed else "red"),
             boresight_parts(steps), summary, record, {"steps": steps_table(steps)},
@@ -161,9 +145,5 @@ def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, f
 
 def print_boresight(steps: Sequence[Step], console: Console) -> None:
     """Print the verdict and the findings of each step."""
-    colour = "green" if all(step.go_on for step in steps) else "red"
-    console.print(boresight_verdict(steps), style=colour, highlight=False, markup=False)
-    for step in steps:
-        console.print(Text.assemble((f"step {step.number}", "bold"), f": {step.title}"))
-        for finding in step.findings:
-            console.print(f"  - {finding}", highlight=False, markup=False)
+    console.print(boresight_verdict(steps), style="green" if all(step.go_on for step in steps) else "red")
+    print_lines((f"step {step.number}: {'; '.join((step.title, *step.findings))}" for step in steps), console)

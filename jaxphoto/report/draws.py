@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
@@ -16,35 +17,22 @@ from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations import AXES
 from jaxphoto.report.formatting import column_unit
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, page, provenance
-from jaxphoto.report.plots import axes_or_new, label, new_figure
+from jaxphoto.report.plots import axes_or_new, label
 from jaxphoto.report.results import assumed_pixels
 from jaxphoto.sensitivity import Draws
-from jaxphoto.statistics import Correlations, Covariance, correlation_matrix
 from jaxphoto.writing import whole_file
 
 if TYPE_CHECKING:
-    import xarray as xr
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
     from jaxphoto.sensitivity.posterior import Posterior
 
-_PICTURES = {
-    "interior": (
-        "Estimates over the draws",
-        "Grey: histogram of the draws; red line: value without errors; blue line: predicted normal distribution.",
-    ),
-    "effects": (
-        "Effect of each error on each estimate",
-        "Effect of one sigma of each error (row) on each estimate (column), relative to its predicted sigma.",
-    ),
-}
 LONG = ("exterior.", "point.", "check.", f"{TrajectoryKnot.kind}.")
 """Column prefixes of images, points and trajectory knots; these quantities are written to files only."""
 EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_rad", "phi_rad", "kappa_rad")
 _QUANTILES = {"q025": 0.025, "q50": 0.5, "q975": 0.975}
-# Maximum number of histograms in a figure; maximum width of the figure (inches).
-_SHOWN, _WIDEST = 12, 10.5
+# Maximum number of histograms, and of errors in the figure of effects.
+_SHOWN, _ERRORS = 12, 60
 
 
 def draws_table(draws: Draws, adjusted: Adjustment, first: int = 0) -> pd.DataFrame:
@@ -81,12 +69,8 @@ def in_degrees(name: str) -> str:
     return name.removesuffix("_rad") + "_deg" if name.endswith("_rad") else name
 
 
-def column_of(path: str) -> str:
-    """Convert `interior[kodak].c_mm` to `kodak.c_mm`, `strips[E1].shift_X_m` to `strips.E1.shift_X_m`."""
-    return in_degrees(_in_radians(path))
-
-
 def _in_radians(path: str) -> str:
+    """Convert `interior[kodak].c_mm` to `kodak.c_mm`, `strips[E1].shift_X_m` to `strips.E1.shift_X_m`."""
     if "[" not in path:
         return path
     kind, rest = path.split("[", 1)
@@ -94,52 +78,22 @@ def _in_radians(path: str) -> str:
     return f"{name}.{parameter}" if kind == "interior" else f"{kind}.{name}.{parameter}"
 
 
-class Moments(NamedTuple):
-    """Mean, standard deviation and quantiles of one column of the draws."""
-
-    mean: float
-    sd: float
-    quantiles: tuple[float, ...]
-
-
-def moments(values: np.ndarray) -> Moments:
-    """Compute the moments of one column of the draws; NaN for too few draws."""
-    values = np.asarray(values, float)
-    if not len(values):
-        return Moments(np.nan, np.nan, (np.nan,) * len(_QUANTILES))
-    sd = float(values.std(ddof=1)) if len(values) > 1 else np.nan
-    return Moments(float(values.mean()), sd, tuple(np.quantile(values, list(_QUANTILES.values()))))
-
-
 def summary_table(
-    moments_of: Mapping[str, Moments],
+    columns: pd.DataFrame,
     nominal: Mapping[str, float],
     predicted: Mapping[str, float],
     cameras: Mapping[str, InteriorOrientation],
 ) -> pd.DataFrame:
-    """Tabulate the moments of the draws and their prediction.
+    """Tabulate the moments of the columns of draws and their prediction.
 
     Columns: quantity, nominal, mean, sd, quantiles, predicted_sigma, ratio (sd over predicted), unit.
     """
-    rows = [(name, nominal.get(name, np.nan), m.mean, m.sd, *m.quantiles) for name, m in moments_of.items()]
-    table = pd.DataFrame(rows, columns=["quantity", "nominal", "mean", "sd", *_QUANTILES])
-    table["predicted_sigma"] = [predicted.get(name, np.nan) for name in moments_of]
+    quantiles = columns.quantile(list(_QUANTILES.values())).set_axis(list(_QUANTILES)).T
+    table = pd.DataFrame({"mean": columns.mean(), "sd": columns.std()}).join(quantiles).reset_index(names="quantity")
+    table.insert(1, "nominal", table["quantity"].map(lambda name: nominal.get(name, np.nan)))
+    table["predicted_sigma"] = table["quantity"].map(lambda name: predicted.get(name, np.nan))
     table["ratio"] = table["sd"] / table["predicted_sigma"]
-    return table.assign(unit=[column_unit(name, cameras) for name in moments_of])
-
-
-def draws_figure(columns: Mapping[str, np.ndarray], summary: pd.DataFrame) -> Figure:
-    """Draw histograms of some columns, with the nominal value and the predicted normal density."""
-    chosen = list(columns)[:_SHOWN]
-    across = min(3, len(chosen))
-    down = -(-len(chosen) // across)
-    figure = new_figure(3.3 * across, 2.5 * down)
-    figure.set_layout_engine("constrained", h_pad=0.1)
-    for axes, name in zip(figure.subplots(down, across, squeeze=False).flat, chosen, strict=False):
-        _draw_histogram(axes, name, np.asarray(columns[name], float), summary)
-    for axes in figure.axes[len(chosen) :]:
-        axes.set_axis_off()
-    return figure
+    return table.assign(unit=[column_unit(name, cameras) for name in table["quantity"]])
 
 
 def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Axes | None = None) -> Axes:
@@ -152,26 +106,21 @@ def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Ax
     if quantity not in quantities or quantity not in draws:
         names = ", ".join(name for name in quantities if name in draws and not name.startswith(LONG))
         raise InputError(f"unknown quantity {quantity!r} of the draws; use one of {names}, or one of images or points")
-    ax = axes_or_new(ax)
-    _draw_histogram(ax, quantity, draws[quantity].to_numpy(float), summary)
-    return ax
-
-
-def _draw_histogram(axes: Axes, name: str, values: np.ndarray, summary: pd.DataFrame) -> None:
-    of = summary.set_index("quantity")
-    nominal, sigma = (float(of[column].loc[name]) for column in ("nominal", "predicted_sigma"))
+    ax, of = axes_or_new(ax), summary[summary["quantity"] == quantity]
+    nominal, sigma = of[["nominal", "predicted_sigma"]].to_numpy(float)[0]
+    values = draws[quantity].to_numpy(float)
     # Skip the histogram if draws differ only by rounding.
     if len(values) and np.ptp(values) > 1e-12 * np.abs(values).max(initial=1e-300):
-        axes.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
-    axes.axvline(nominal, color="tab:red", lw=1)
+        ax.hist(values, bins=min(60, max(5, int(np.sqrt(len(values))))), density=True, color="0.75")
+    ax.axvline(nominal, color="tab:red", lw=1)
     if sigma > 0:
         at = np.linspace(-4, 4, 200)
-        density = np.exp(-0.5 * at**2) / sigma / np.sqrt(2 * np.pi)
-        axes.plot(nominal + sigma * at, density, color="tab:blue", lw=1)
-    axes.set_title(label(name), fontsize=9)
-    axes.set_yticks([])
-    axes.tick_params(labelsize=7)
-    axes.locator_params(axis="x", nbins=4)
+        ax.plot(nominal + sigma * at, np.exp(-0.5 * at**2) / sigma / np.sqrt(2 * np.pi), color="tab:blue", lw=1)
+    ax.set_title(label(quantity), fontsize=9)
+    ax.set_yticks([])
+    ax.tick_params(labelsize=7)
+    ax.locator_params(axis="x", nbins=4)
+    return ax
 
 
 def plot_effects(
@@ -195,13 +144,6 @@ def plot_effects(
     return ax
 
 
-def effects_figure(effects: pd.DataFrame, summary: pd.DataFrame, quantities: list[str]) -> Figure:
-    """Draw `plot_effects` in a figure of suitable size."""
-    figure = new_figure(min(1.8 + 0.8 * len(quantities), _WIDEST), max(3.2, 1.8 + 0.26 * len(effects)))
-    plot_effects(effects, summary, quantities, figure.subplots())
-    return figure
-
-
 def write_draws_page(
     summary: Mapping[str, Any],
     table: pd.DataFrame,
@@ -209,19 +151,27 @@ def write_draws_page(
     directory: Path,
     record: CommandRecord,
 ) -> None:
-    """Write report.html of the draws into `directory`: summary, its table, and the plots in the folder."""
+    """Write report.html of the draws in `directory`: summary, its table, histograms and effects."""
     few = ~table["quantity"].str.startswith(LONG)
     ratio = table.loc[few, "ratio"].dropna()
     ratios = "No estimate is predicted to change."
     if len(ratio):
         ratios = f"Standard deviations are {ratio.min():.3g} to {ratio.max():.3g} times the first-order prediction."
     verdict = f"{summary['draws']} draws, {summary['converged']} converged. {ratios}"
-    parts: list[Part] = [*assumed_pixels(sensors)]
-    for name, (heading, words) in _PICTURES.items():
-        if (file := directory / f"{name}.png").is_file():
-            parts += [Heading(heading), Paragraph(words), Plot(file, f"{heading}: {words}")]
     # List the errors last: their distribution is known.
     ordered = table[few].sort_values("quantity", key=lambda name: name.str.startswith("bias."), kind="stable")
+    shared = [name for name in ordered["quantity"] if not name.startswith("bias.")]
+    draws = pd.read_parquet(directory / "draws.parquet", columns=["converged", *shared[:_SHOWN]])
+    plots: list[Plot] = [
+        Plot(partial(plot_draws, draws[draws["converged"]], table, name), f"histogram of {name}", 2.6)
+        for name in shared[:_SHOWN]
+    ]
+    words = "Grey: histogram of the draws; red line: value without errors; blue line: predicted normal distribution."
+    parts: list[Part] = [*assumed_pixels(sensors), Heading("Estimates over the draws"), Paragraph(words), plots]
+    if (file := directory / "effects.csv").is_file() and len(effects := pd.read_csv(file)) <= _ERRORS:
+        words = "Effect of one sigma of each error (row) on each estimate (column), relative to its predicted sigma."
+        draw = partial(plot_effects, effects, table, [name for name in shared if name in effects])
+        parts += [Heading("Effect of each error on each estimate"), Plot(draw, words, max(3.2, 1 + 0.2 * len(effects)))]
     parts += [Heading("Means and standard deviations"), ordered]
     if not few.all():
         parts.append(Paragraph("Images, points and trajectory knots are in summary.csv."))
@@ -230,80 +180,7 @@ def write_draws_page(
         work.write_text(text, encoding="utf-8")
 
 
-# xarray data sets for arrays of more than two dimensions: correlations by image, draws by image and point. Values are
-# in radians, metres and millimetres, as stated in the coordinate names.
-
-
-def correlation_cube(correlations: Correlations) -> xr.Dataset:
-    """Return the correlations of a camera as an xarray data set.
-
-    Variables: `interior` (parameter, with_parameter), `exterior` (image, element, parameter), `within_image` (image,
-    element, with_element).
-    """
-    # Import locally: xarray takes a third of a second.
-    import xarray as xr
-
-    c = correlations
-    return xr.Dataset(
-        {
-            "interior": (("parameter", "with_parameter"), c.interior),
-            "exterior": (("image", "element", "parameter"), c.exterior),
-            "within_image": (("image", "element", "with_element"), c.within_image),
-        },
-        coords={
-            "parameter": list(c.parameters),
-            "with_parameter": list(c.parameters),
-            "image": list(c.images),
-            "element": list(c.eop_names),
-            "with_element": list(c.eop_names),
-        },
-        attrs={"camera": c.camera},
-    )
-
-
-def covariance_array(known: Covariance) -> xr.DataArray:
-    """Return the correlations of all exterior orientations and shared unknowns as an xarray array.
-
-    Dimensions: (unknown, with_unknown). The coordinate `sigma` (unknown) is a posteriori, in the units of the labels. A
-    fixed unknown has zero sigma and no correlation.
-    """
-    import xarray as xr
-
-    names = list(known.labels)
-    sigma = np.concatenate([np.asarray(known.exterior_sigma).ravel(), np.asarray(known.shared_sigma)])
-    coords = {"unknown": names, "with_unknown": names, "sigma": ("unknown", sigma)}
-    return xr.DataArray(correlation_matrix(known), coords, ("unknown", "with_unknown"), name="correlation")
-
-
-def draws_cube(draws: Draws, adjusted: Adjustment) -> xr.Dataset:
-    """Return the draws of a Monte Carlo simulation as an xarray data set.
-
-    Variables: `shared` (draw, parameter), `error` (draw, of_error), `converged`, `iterations` and `fallback` (draw). If
-    stored, also `exterior` (draw, image, element) and `points` (draw, point, axis).
-    """
-    import xarray as xr
-
-    variables: dict[str, tuple[tuple[str, ...], np.ndarray]] = {
-        "shared": (("draw", "parameter"), draws.shared),
-        "converged": (("draw",), draws.converged),
-        "iterations": (("draw",), draws.steps),
-        "fallback": (("draw",), draws.fallback),
-    }
-    coords: dict[str, object] = {"draw": np.arange(len(draws.steps)), "parameter": list(draws.labels)}
-    if draws.recorded:
-        variables["error"] = ("draw", "of_error"), np.stack(list(draws.recorded.values()), axis=1)
-        coords["of_error"] = list(draws.recorded)
-    if draws.exterior is not None:
-        variables["exterior"] = ("draw", "image", "element"), draws.exterior
-        coords |= {"image": list(adjusted.block.images), "element": list(EXTERIOR)}
-    if draws.points is not None:
-        variables["points"] = ("draw", "point", "axis"), draws.points
-        coords |= {"point": list(adjusted.block.points), "axis": list(AXES)}
-    return xr.Dataset(variables, coords)
-
-
 _ANGLES = ("omega", "phi", "kappa")
-_PANEL, _ACROSS = 2.6, 4
 _NORMAL_97_5 = 1.959964
 
 
@@ -329,53 +206,9 @@ def posterior_table(posterior: Posterior) -> pd.DataFrame:
     )  # fmt: skip
 
 
-def posterior_figure(posterior: Posterior) -> Figure:
-    """Draw the sample of each parameter with its Gaussian, and the pair that deviates most from its 95 % ellipse."""
-    names, factor = _names_and_factors(posterior)
-    k = len(names)
-    panels = k + (k > 1)
-    down = -(-panels // _ACROSS)
-    figure = new_figure(_PANEL * min(panels, _ACROSS), _PANEL * down)
-    places = [figure.add_subplot(down, min(panels, _ACROSS), 1 + n) for n in range(panels)]
-    draws, optimum = posterior.draws * factor, posterior.optimum * factor
-    laplace = posterior.laplace * np.outer(factor, factor)
-    for j, axes in enumerate(places[:k]):
-        _marginal(axes, draws[:, j], optimum[j], np.sqrt(laplace[j, j]))
-        axes.set_xlabel(label(names[j]), fontsize=8)
-    if k > 1:
-        pair = list(np.unravel_index(np.argmax(posterior.outside), posterior.outside.shape))
-        _pair(places[k], draws[:, pair], optimum[pair], laplace[np.ix_(pair, pair)])
-        places[k].set_xlabel(label(names[pair[0]]), fontsize=8)
-        places[k].set_ylabel(label(names[pair[1]]), fontsize=8)
-        places[k].set_title(f"{100 * posterior.outside[tuple(pair)]:.0f} % outside, not 5 %", fontsize=8)
-    for axes in places:
-        axes.tick_params(labelsize=7)
-        axes.locator_params(axis="x", nbins=4)
-    places[0].legend(fontsize=7)
-    return figure
-
-
 def _names_and_factors(posterior: Posterior) -> tuple[list[str], np.ndarray]:
     """Return the names with units, and the factors to these units."""
-    names, factor = [], np.ones(len(posterior.parameters))
-    for j, parameter in enumerate(posterior.parameters):
-        last = parameter.rsplit(".", 1)[-1]
-        if last in _ANGLES:
-            factor[j] = np.rad2deg(1.0)
-        names.append(parameter + ("_deg" if last in _ANGLES else "_m" if last in ("X", "Y", "Z") else ""))
-    return names, factor
-
-
-def _marginal(axes: Axes, sample: np.ndarray, optimum: float, sigma: float) -> None:
-    axes.hist(sample, bins=40, density=True, color="tab:blue", alpha=0.5, label="posterior")
-    x = np.linspace(min(sample.min(), optimum - 3 * sigma), max(sample.max(), optimum + 3 * sigma), 200)
-    density = np.exp(-0.5 * ((x - optimum) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-    axes.plot(x, density, color="tab:red", lw=1.2, label="Laplace")
-    axes.set_yticks([])
-
-
-def _pair(axes: Axes, sample: np.ndarray, optimum: np.ndarray, covariance: np.ndarray) -> None:
-    axes.plot(*sample.T, ".", ms=1.5, color="tab:blue", alpha=0.4)
-    turn = np.linspace(0, 2 * np.pi, 200)
-    circle = np.sqrt(-2 * np.log(0.05)) * np.stack([np.cos(turn), np.sin(turn)])
-    axes.plot(*(optimum[:, None] + np.linalg.cholesky(covariance) @ circle), color="tab:red", lw=1.2)
+    last = [parameter.rsplit(".", 1)[-1] for parameter in posterior.parameters]
+    units = ["_deg" if name in _ANGLES else "_m" if name in AXES else "" for name in last]
+    names = [parameter + unit for parameter, unit in zip(posterior.parameters, units, strict=True)]
+    return names, np.where([unit == "_deg" for unit in units], np.rad2deg(1.0), 1.0)

@@ -23,7 +23,7 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 COLOURS: dict[Severity, str] = {"error": "red", "warning": "amber", "note": "green"}
 MARKS: dict[Severity, str] = {"error": "!!", "warning": "!", "note": "-"}
 _SYMBOLS = {"c_mm": "c", "xp_mm": "x_p", "yp_mm": "y_p"}
-_TEMPLATES: dict[str, str] = tomllib.loads(
+_DECLARED: dict[str, dict[str, str]] = tomllib.loads(
     (files("jaxphoto.report") / "templates" / "findings.toml").read_text(encoding="utf-8")
 )
 
@@ -38,13 +38,17 @@ class Finding:
     value: float = math.nan
     limit: float = math.nan
     hint: str = ""
+    """Cure; by default that of the code."""
     numbers: Mapping[str, Any] = dataclasses.field(default_factory=dict)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "hint", self.hint or _DECLARED["hint"].get(self.code, ""))
 
     @property
     def text(self) -> str:
         """Text of the finding, followed by its hint."""
         fields = {"subject": self.subject, "value": self.value, "limit": self.limit}
-        fact = _TEMPLATES[self.code].format_map(fields | dict(self.numbers))
+        fact = _DECLARED["text"][self.code].format_map(fields | dict(self.numbers))
         return without_powers(in_symbols(f"{fact}. {self.hint}" if self.hint else fact))
 
     @property

@@ -8,6 +8,7 @@ import math
 import re
 from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pandas as pd
@@ -198,7 +199,10 @@ def _sigmas_of(table: pd.DataFrame, name: str) -> pd.Series | None:
 
 
 def _word(value: object) -> str:
-    return {True: "yes", False: "no"}[bool(value)] if isinstance(value, bool | np.bool_) else str(value)
+    if isinstance(value, bool | np.bool_):
+        return "yes" if value else "no"
+    # Markup, a kind of str, stays unescaped.
+    return value if isinstance(value, str) else str(value)
 
 
 def without_empty(table: pd.DataFrame) -> pd.DataFrame:
@@ -230,54 +234,11 @@ def to_markdown(table: pd.DataFrame, name: str = "") -> str:
     return "\n".join(([f"## {head_of(name)}", ""] if name else []) + lines) + "\n"
 
 
-# LaTeX -----------------------------------------------------------------------------------------------------------
-
-_SPECIAL = {letter: f"\\{letter}" for letter in "&%$#_{}"} | {
-    "~": r"\textasciitilde{}", "^": r"\textasciicircum{}", "\\": r"\textbackslash{}", "<": r"\textless{}",
-    ">": r"\textgreater{}", "|": r"\textbar{}",
-}  # fmt: skip
-_POWER = re.compile(r"^(-?[\d.]+)e([+-]?\d+)$")
-_PER_MM = re.compile(r"^1/mm(?:\^(\d+))?$")
-_GREEK = ("omega", "phi", "kappa", "sigma")
-# Maximum number of rows of a LaTeX table on one page.
-_PAGE = 45
-
-
 def to_latex(table: pd.DataFrame, name: str = "") -> str:
-    """Convert a table to LaTeX with booktabs rules (\\usepackage{booktabs}, and longtable for long ones)."""
-    shown = readable(table)
-    shown = pd.DataFrame({_latex_head(str(c)): [_latex(v) for v in shown[c]] for c in shown.columns})
-    return shown.to_latex(
-        index=False,
-        escape=False,
-        column_format="".join("r" if right else "l" for right in numeric_columns(table)),
-        longtable=len(table) > _PAGE,
-        caption=_latex(head_of(name)) if name else None,
-        label=f"tab:{name}" if name else None,
-    )
-
-
-def _latex(text: str) -> str:
-    if power := _POWER.match(text):
-        return rf"${power[1]} \times 10^{{{int(power[2])}}}$"
-    if per_mm := _PER_MM.match(text):
-        return f"mm$^{{-{per_mm[1] or 1}}}$"
-    escaped = "".join(_SPECIAL.get(letter, letter) for letter in text)
-    if escaped.startswith(("[", "*")):
-        # LaTeX would read a bracket after the end of a row as its option.
-        escaped = f"{{}}{escaped}"
-    return rf"$-${escaped[1:]}" if re.fullmatch(r"-[\d.]+", text) else escaped
-
-
-def _latex_head(name: str) -> str:
-    """Return a column head with Greek letters: `$\\sigma_{\\omega}$ [deg]` for sigma_omega_deg."""
-    head, _, unit = head_of(name).partition(" [")
-    words = [rf"\{word}" if word in _GREEK else word for word in head.split()]
-    if words[:1] == [r"\sigma"] and len(words) == 2:
-        head = rf"$\sigma_{{{words[1]}}}$"
-    else:
-        head = " ".join(f"${word}$" if word.startswith("\\") else _latex(word) for word in words)
-    return f"{head} [{unit}" if unit else head
+    """Convert a table to LaTeX with booktabs rules (\\usepackage{booktabs})."""
+    columns = "".join("r" if right else "l" for right in numeric_columns(table))
+    names: dict[str, Any] = {"caption": head_of(name), "label": f"tab:{name}"} if name else {}
+    return readable(table).rename(columns=head_of).to_latex(index=False, escape=True, column_format=columns, **names)
 
 
 # Files -----------------------------------------------------------------------------------------------------------

@@ -2,15 +2,14 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
-from rich.console import Console
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import InputError
@@ -21,17 +20,15 @@ from jaxphoto.procedures.lidar.vertical_control import flag_counts
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.formatting import without_empty, without_unit
 from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot, page, provenance, verdict_parts
-from jaxphoto.report.plots import axes_or_new, new_figure, title
+from jaxphoto.report.plots import axes_or_new, title
 from jaxphoto.report.results import summary_of, write_results, write_study
 from jaxphoto.report.tables import Tables
-from jaxphoto.report.terminal import print_lines
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import angle_differences, correlation_matrix
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Maximum number of rows of a long table on a page.
 _ROWS = 30
@@ -74,25 +71,21 @@ def moved_table(result: Simultaneous) -> pd.DataFrame:
     rotations, object points and laser points, and the RMS height of points above the surface.
     """
     after, before = result.adjusted, result.before
-    sigma = np.asarray(Tables(after).covariance.shared_sigma)
     # Only scanner parameters have no value before the adjustment; use zero.
     then, now = (dict(zip(a.parameters, np.asarray(a.values.shared).tolist(), strict=True)) for a in (before, after))
     rows: list[tuple] = []
-    for path, s in zip(after.structure.labels, sigma, strict=True):
-        name = path.replace("_rad", "_deg")
-        factor, old, value = 180 / np.pi if path.endswith("_rad") else 1.0, then.get(path, 0.0), now[path]
-        moved = factor * (value - old)
-        rows.append((name, factor * old, factor * value, moved, factor * float(s), without_unit(name)[1]))
-    position, points = (
-        np.asarray(getter(after)) - np.asarray(getter(before))
-        for getter in (lambda a: a.unknowns.exterior.position, lambda a: a.unknowns.points)
-    )
-    moves = {f"camera stations, {axis}": (position[:, k], "m") for k, axis in enumerate(AXES)}
+    for path, s in zip(after.structure.labels, np.asarray(Tables(after).covariance.shared_sigma), strict=True):
+        name, factor = path.replace("_rad", "_deg"), 180 / np.pi if path.endswith("_rad") else 1.0
+        old, new = factor * then.get(path, 0.0), factor * now[path]
+        rows.append((name, old, new, new - old, factor * float(s), without_unit(name)[1]))
+    exterior = np.asarray(after.unknowns.exterior.position) - np.asarray(before.unknowns.exterior.position)
+    points = np.asarray(after.unknowns.points) - np.asarray(before.unknowns.points)
     angles = np.rad2deg(angle_differences(after, before)[1])
-    moves |= {f"images, {name}": (angles[:, k], "deg") for k, name in enumerate(("omega", "phi", "kappa"))}
-    moves |= {f"object points, {axis}": (points[:, k], "m") for k, axis in enumerate(AXES)}
-    moves |= {f"laser points, {axis}": (result.moved_cloud[k : k + 1], "m") for k, axis in enumerate(AXES)}
-    rows += [(what, np.nan, np.nan, _rms(values), np.nan, unit) for what, (values, unit) in moves.items()]
+    for what, names, values, unit in (
+        ("camera stations", AXES, exterior, "m"), ("images", ("omega", "phi", "kappa"), angles, "deg"),
+        ("object points", AXES, points, "m"), ("laser points", AXES, np.atleast_2d(result.moved_cloud), "m"),
+    ):  # fmt: skip
+        rows += [(f"{what}, {n}", np.nan, np.nan, _rms(values[:, k]), np.nan, unit) for k, n in enumerate(names)]
     both = [_rms(v) for v in (result.apart_before, result.apart)]
     rows.append(("points above the surface, RMSE", *both, both[1] - both[0], np.nan, "m"))
     return pd.DataFrame(rows, columns=["what", "before", "after", "moved", "sigma", "unit"])
@@ -135,19 +128,18 @@ def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residua
     points, used = np.asarray(control.adjusted.unknowns.points)[control.points], control.used
     if residuals and not used.any():
         raise InputError("no height of the cloud is used as control: no residuals to draw")
-    ax = axes_or_new(ax)
+    ax, missing = axes_or_new(ax), ~np.isfinite(control.height)
     if residuals:
-        difference = (control.height - points[:, 2])[used]
-        name = f"cloud minus adjusted: RMSE {_rms(difference):.3f} m"
-        _draw_heights(ax, points[used], difference, difference, "cloud minus adjusted height [m]", name)
+        v = (control.height - points[:, 2])[used]
+        name = f"cloud minus adjusted: RMSE {_rms(v):.3f} m"
+        _draw_heights(ax, points[used], v, v, "cloud minus adjusted height [m]", name)
         return ax
-    missing = ~np.isfinite(control.height)
     sets = ((missing, "no height", "0.6", "+"), (used, "control", "tab:blue", "o"))
     for chosen, words, colour, marker in (*sets, (~used & ~missing, "rejected", "#D55E00", "x")):
         ax.plot(*points[chosen, :2].T, marker, ms=5, color=colour, ls="none", label=f"{words} ({chosen.sum()})")
     ax.legend(loc="best", fontsize=8)
+    ax.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
     title(ax, "heights of the cloud")
-    _ground(ax)
     return ax
 
 
@@ -157,43 +149,19 @@ def _draw_heights(axes: Axes, points: np.ndarray, values: np.ndarray, scale: np.
     colours: dict[str, Any] = {"c": values, "cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     shown = axes.scatter(points[:, 0], points[:, 1], s=18, edgecolor="0.6", **colours)
     axes.figure.colorbar(shown, ax=axes, label=words, shrink=0.8)
-    title(axes, name)
-    _ground(axes)
-
-
-def _ground(axes: Axes) -> None:
     axes.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
     axes.ticklabel_format(useOffset=False, style="plain")
-    axes.locator_params(nbins=6)
-
-
-def above_figure(result: Simultaneous) -> Figure:
-    """Draw `plot_above` before and after."""
-    figure = new_figure(10.0, 4.6)
-    for axes, before in zip(figure.subplots(1, 2, sharex=True, sharey=True), (True, False), strict=True):
-        plot_above(result, axes, before=before)
-    return figure
-
-
-def heights_figure(control: LidarControl) -> Figure:
-    """Draw both plots of `plot_lidar_heights`."""
-    figure = new_figure(10.0, 4.6)
-    for axes, residuals in zip(figure.subplots(1, 2, sharex=True, sharey=True), (False, True), strict=True):
-        if not residuals or control.used.any():
-            plot_lidar_heights(control, axes, residuals=residuals)
-    return figure
+    title(axes, name)
 
 
 @contextmanager
 def write_simultaneous(
     result: Simultaneous, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> Iterator[Path]:
-    """Write the tables of iterations, changes, surfaces and correlations, a plot, the report and the adjustment.
+    """Write the tables of iterations, changes, surfaces and correlations, the report and the folder `adjustment`.
 
-    Files also include summary.json and the result folder `adjustment`. Yields the temporary folder so that the caller
-    can add files. Raises InputError if `directory` contains anything but an earlier result.
+    Yields the temporary folder so that the caller can add files.
     """
-    began = time.perf_counter()
     with whole_folder(directory) as work:
         tables = Tables(result.adjusted)
         verdict, times = verdict_of(tables), result.adjusted.seconds
@@ -204,13 +172,14 @@ def write_simultaneous(
             moved_table(result),
             scanner_correlations(result.adjusted),
         )
-        figure, free = above_figure(result), moved["sigma"].notna()
+        free = moved["sigma"].notna()
         parts: list[Part] = [
             *verdict_parts(verdict),
             *(Paragraph(as_sentence(sentence)) for sentence in rounds_words(result.rounds, result.converged)),
             Link("all results of the images", "adjustment/report.html"), Heading("Changes"), moved[free],
             Paragraph("Root mean square changes:"), without_empty(moved[~free]),
-            Plot(figure, "points above the surface of the cloud, before and after"), Heading("Iterations"),
+            [Plot(partial(plot_above, result, before=b), f"points above the cloud {w}", 4)
+             for b, w in ((True, "before"), (False, "after"))], Heading("Iterations"),
             rounds.replace(np.inf, np.nan), Heading("Correlations of the scanner"),
             Paragraph("The strongest; all are in scanner_correlation.csv."), _strongest(correlations),
         ]  # fmt: skip
@@ -220,12 +189,11 @@ def write_simultaneous(
             "surfaces": surfaces_table(result),
             "scanner_correlation": correlations,
         }
-        summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
+        summary = summary_of(tables, verdict, seconds)
         write_study(
             work, f"{tables.adjusted.block.title or 'Block'} and cloud, adjusted together",
             (verdict.headline, verdict.colour), parts,
             summary | {"rounds": len(result.rounds), "iteration_converged": result.converged}, record, files,
-            {"above": figure},
         )  # fmt: skip
         yield work
 
@@ -249,39 +217,26 @@ def rounds_words(rounds: Sequence[Round], converged: bool) -> tuple[str, str]:
     )
 
 
-def print_rounds(rounds: Sequence[Round], converged: bool, console: Console) -> None:
-    """Print the outer iterations."""
-    print_lines(rounds_words(rounds, converged), console)
-
-
-def heights_page(control: LidarControl, figure: Figure, record: CommandRecord) -> str:
-    """Return the page of cloud heights as control: iterations, flags, plot, and the largest differences."""
+def heights_page(control: LidarControl, record: CommandRecord) -> str:
+    """Return the page of cloud heights as control: iterations, flags, plots, and the largest differences."""
     heights = heights_table(control)
     heights.insert(5, "difference_m", heights["height_m"] - heights["Z_m"])
     largest = heights.sort_values("difference_m", key=np.abs, ascending=False, kind="stable")[:_ROWS]
-    metres = largest.select_dtypes(float)
-    written = {str(name): metres[name].map("{:z.3f}".format).where(metres[name].notna(), "") for name in metres}
-    words = [*rounds_words(control.rounds, control.converged)]
-    words.append(f"{int(control.used.sum())} of {len(control.points)} tie points have a control height")
-    parts: list[Part] = [
-        *(Paragraph(as_sentence(sentence)) for sentence in words[1:]),
-        Heading("Over the ground"),
-        Plot(figure, "heights of the cloud as control, and their residuals"),
-        Heading("Iterations"),
-        rounds_table(control.rounds).replace(np.inf, np.nan),
+    words = rounds_words(control.rounds, control.converged)
+    used = f"{int(control.used.sum())} of {len(control.points)} tie points have a control height"
+    plots = [
+        Plot(partial(plot_lidar_heights, control, residuals=r), name, 4)
+        for r, name in ((False, "heights of the cloud as control"), (True, "residuals of the control heights"))
+        if control.used.any() or not r
     ]
+    parts: list[Part] = [
+        *(Paragraph(as_sentence(text)) for text in (words[1], used)),
+        Heading("Over the ground"),
+        plots,
+    ]
+    parts += [Heading("Iterations"), rounds_table(control.rounds).replace(np.inf, np.nan)]
     if flags := flag_counts(control.flag):
         parts.append(pd.DataFrame({"flag": [name.lower() for name in flags], "heights": list(flags.values())}))
-    parts += [Heading("Largest differences"), without_empty(largest.assign(**written))]
+    parts += [Heading("Largest differences"), without_empty(largest.round(3))]
     parts += [Paragraph("All heights are in lidar_heights.csv."), *provenance(record)]
     return page(f"{control.block.title or 'Block'}: heights of a cloud as control", parts, (words[0], ""))
-
-
-def print_moved(result: Simultaneous, console: Console) -> None:
-    """Print every change, one per line."""
-    lines = []
-    for what, before, after, moved, sigma, unit in moved_table(result).itertuples(index=False):
-        range_words = f" from {before:.6g} to {after:.6g}" if np.isfinite(before) else ""
-        spread = f" (sigma {sigma:.2g})" if np.isfinite(sigma) else ""
-        lines.append(f"  {what}:{range_words} by {moved:.4g} {unit}{spread}".rstrip())
-    print_lines(lines, console)

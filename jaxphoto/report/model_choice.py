@@ -3,10 +3,9 @@
 from __future__ import annotations
 
 import math
-import time
-from collections.abc import Callable
+from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -15,30 +14,21 @@ from rich.console import Console
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.procedures.model_choice import ModelChoice
-from jaxphoto.report.formatting import of_p, to_rich, without_empty
+from jaxphoto.report.formatting import to_rich, without_empty
 from jaxphoto.report.page import CommandRecord, Heading, Part, Plot
-from jaxphoto.report.plots import axes_or_new, label, new_figure, title
+from jaxphoto.report.plots import axes_or_new, label, title
 from jaxphoto.report.results import assumed_pixels, rounded, write_study
 from jaxphoto.report.terminal import print_lines
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
-# Columns of `choice_table` on the page, with their formats; the terminal shows only some of them.
-_SHOWN: dict[str, Callable[[Any], str]] = {
-    "model": str, "parameters": str, "sigma0": "{:.3f}".format, "rms_px": "{:.4f}".format,
-    "cv_rms_px": "{:.4f}".format, "cv_excess_se": "{:.1f}".format, "delta_aicc": "{:.1f}".format,
-    "delta_bic": "{:.1f}".format, "smaller": str, "f": "{:.2f}".format, "f_p": of_p, "weakest": str,
-    "weakest_ratio": "{:.1f}".format,
-}  # fmt: skip
-_IN_TERMINAL = ("model", "parameters", "rms_px", "cv_rms_px", "cv_excess_se", "delta_bic", "f_p")
+# Columns of `choice_table` in the terminal, and further ones on the page.
+_IN_TERMINAL = ["model", "parameters", "rms_px", "cv_rms_px", "cv_excess_se", "delta_bic", "f_p"]
+_ON_PAGE = [*_IN_TERMINAL, "sigma0", "delta_aicc", "smaller", "f", "weakest", "weakest_ratio"]
 # Difference of BIC below which two models are equally good (Kass and Raftery 1995).
 _EQUAL = 2.0
-# Ticks of the logarithmic axis; value above which labels have no decimal places.
-_MARKS = (0, 2, 10, 100, 1000, 10_000, 100_000, 1_000_000)
-_FAR = 100.0
 
 
 def choice_table(choice: ModelChoice) -> pd.DataFrame:
@@ -96,16 +86,6 @@ def choice_verdict(choice: ModelChoice) -> list[str]:
     return sentences + [f"{j.candidate.name} could not be adjusted: {j.problem}" for j in choice.judged if j.problem]
 
 
-def choice_figure(choice: ModelChoice) -> Figure:
-    """Draw both plots of `plot_models` side by side; empty if no model could be adjusted."""
-    known = [j for j in choice.judged if math.isfinite(j.bic)]
-    figure = new_figure(9.6, 1.2 + 0.36 * max(len(known), 3))
-    if known:
-        for axes, rms in zip(figure.subplots(1, 2, sharey=True), (False, True), strict=True):
-            plot_models(choice, axes, rms=rms)
-    return figure
-
-
 def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = False) -> Axes:
     """Draw BIC minus the smallest BIC by model, or the `rms` of adjusted and held-out image points (px).
 
@@ -126,16 +106,11 @@ def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = Fals
     else:
         above = np.array([j.bic for j in judged])
         above -= above.min()
-        # Start bars at one because a logarithmic axis has no zero.
-        ax.barh(at, above, left=1.0, color="tab:blue")
+        ax.barh(at, above, color="tab:blue")
         for k, one in enumerate(above):
-            ax.text(1 + one, k, f" {one:.1f}" if one < _FAR else f" {one:,.0f}", va="center", fontsize=8)
-        ax.set_xscale("log")
-        most = max(above.max(), _MARKS[1])
-        ax.set_xlim(1.0, 4 * (1 + most))
-        marks = [mark for mark in _MARKS if mark <= most]
-        ax.set_xticks([1.0 + mark for mark in marks], [f"{mark:g}" for mark in marks], minor=False)
-        ax.minorticks_off()
+            ax.text(one, k, f" {one:,.1f}", va="center", fontsize=8)
+        ax.set_xscale("symlog", linthresh=_EQUAL)
+        ax.set_xlim(0.0, 4 * (1 + above.max()))
         ax.set_xlabel("BIC above the smallest", fontsize=9)
         title(ax, f"BIC prefers {label(choice.by_bic)}")
     ax.set_yticks(at, [label(f"{j.candidate.name} ({j.n_parameters})") for j in judged], fontsize=8)
@@ -146,40 +121,29 @@ def plot_models(choice: ModelChoice, ax: Axes | None = None, *, rms: bool = Fals
 def write_model_choice(
     choice: ModelChoice, block: Block, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> None:
-    """Write models.csv, parameters.csv, models.png, report.html and summary.json.
-
-    Raises InputError if `directory` contains anything but an earlier result.
-    """
-    began, verdict, figure = time.perf_counter(), choice_verdict(choice), choice_figure(choice)
-    table, parameters = choice_table(choice), parameter_table(choice)
+    """Write models.csv, parameters.csv, report.html and summary.json."""
+    verdict, table, parameters = choice_verdict(choice), choice_table(choice), parameter_table(choice)
+    names = {False: "BIC above the smallest, by model", True: "RMS of image points adjusted and held out, by model"}
+    plots: list[Plot] = [Plot(partial(plot_models, choice, rms=rms), name) for rms, name in names.items()]
     parts: list[Part] = [
         *assumed_pixels(block.sensors),
         Heading("Models"),
-        _shown(table),
-        Plot(figure, "BIC above the smallest, and RMS of image points adjusted and held out, by model"),
+        without_empty(table[_ON_PAGE]),
+        plots if choice.by_bic else [],
         Heading("Estimated parameters of every model"),
         parameters,
     ]
     summary = {
         "title": block.title, "verdict": verdict, "by_bic": choice.by_bic, "by_prediction": choice.by_prediction,
-        "n_left_out": choice.n_left_out, "models": table["model"].tolist(),
-        "seconds": rounded(seconds | {"write": time.perf_counter() - began}),
+        "n_left_out": choice.n_left_out, "models": table["model"].tolist(), "seconds": rounded(seconds),
     }  # fmt: skip
+    tables = {"models": table, "parameters": parameters}
     with whole_folder(directory) as work:
-        write_study(
-            work, f"{block.title or 'block'}: models", (". ".join(verdict), ""), parts, summary, record,
-            {"models": table, "parameters": parameters}, {"models": figure},
-        )  # fmt: skip
+        name = f"{block.title or 'block'}: models"
+        write_study(work, name, (". ".join(verdict), ""), parts, summary, record, tables)
 
 
 def print_model_choice(choice: ModelChoice, console: Console) -> None:
     """Print the choice and its table."""
     print_lines(choice_verdict(choice), console)
-    shown = _shown(choice_table(choice))
-    console.print(to_rich(shown[[name for name in _IN_TERMINAL if name in shown]]))
-
-
-def _shown(table: pd.DataFrame) -> pd.DataFrame:
-    """Format the displayed columns as text."""
-    columns = {name: ["" if pd.isna(v) else form(v) for v in table[name]] for name, form in _SHOWN.items()}
-    return without_empty(pd.DataFrame(columns))
+    console.print(to_rich(without_empty(choice_table(choice)[_IN_TERMINAL])))

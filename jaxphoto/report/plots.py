@@ -12,14 +12,15 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import TOLERANCE, Adjustment
+from jaxphoto.adjustment import Adjustment
 from jaxphoto.block_edits import one_camera
-from jaxphoto.camera import Sensor
+from jaxphoto.camera import Sensor, parameter_names
 from jaxphoto.errors import InputError, camera_words, printable
 from jaxphoto.observations import AXES
 from jaxphoto.report.findings import symbol
 from jaxphoto.report.tables import Tables
-from jaxphoto.statistics.block_geometry import Coverage, ImageLinks, WeakLink, coverage, image_links, weak_links
+from jaxphoto.stability import NORMAL_95, DistortionCurve, distortion_curve
+from jaxphoto.statistics.block_geometry import Coverage, coverage, image_links
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_map
 
 if TYPE_CHECKING:
@@ -327,16 +328,6 @@ def correlation_figure(tables: Tables, camera: str | None = None) -> Figure:
     return figure
 
 
-# Minimum number of contours; candidate contour levels (times powers of ten), of which the first set with enough
-# contours is used.
-_LINES = 5
-_ROUND = (
-    (1.0, 2.0, 5.0),
-    (1.0, 1.5, 2.0, 3.0, 4.0, 5.0, 7.0),
-    (*np.arange(1.0, 2.0, 0.1), *np.arange(2.0, 5.0, 0.2), *np.arange(5.0, 10.0, 0.5)),
-)
-
-
 def plot_sigma_map(
     tables: Tables, camera: str | None = None, ax: Axes | None = None, *, distance_m: float = float("inf")
 ) -> Axes:
@@ -347,21 +338,11 @@ def plot_sigma_map(
 
 
 def draw_sigma_map(axes: Axes, sensor: Sensor, one: SigmaMap) -> None:
-    """Draw the standard deviation in the worst direction (px), with contours at round values."""
-    x, y = (np.unique(v) for v in one.points.T)
-    if len(x) * len(y) != len(one.points):
-        raise ValueError("the points of a map must form a grid of rows and columns")
-    worst = np.ma.masked_invalid(one.worst.reshape(len(y), len(x)) / sensor.pixel_mm)
-    levels = _levels(worst.compressed())
-    if levels:
-        filled = axes.contourf(x, y, worst, levels=levels, cmap="cividis", norm="log")
-        lines = axes.contour(x, y, worst, levels=levels, colors="white", linewidths=0.7)
-        axes.clabel(lines, fmt="%g", fontsize=8)
-        bar = axes.figure.colorbar(filled, ax=axes, shrink=0.9, ticks=levels, format="%g")
-        bar.ax.minorticks_off()
-        bar.set_label("worst direction [px]")
-    draw_format(axes, sensor)
-    title(axes, f"sigma {distance_words(one.distance_m)}")
+    """Draw the standard deviation in the worst direction (px)."""
+    worst = np.asarray(one.worst)
+    known = np.isfinite(worst)
+    name = f"sigma {distance_words(one.distance_m)}, worst direction [px]"
+    draw_format_map(axes, sensor, np.asarray(one.points)[known], name, worst[known] / sensor.pixel_mm)
 
 
 def distance_words(distance_m: float) -> str:
@@ -371,17 +352,47 @@ def distance_words(distance_m: float) -> str:
     return f"of a point at {distance_m:.0f} m" if distance_m >= 100 else f"of a point at {distance_m:.3g} m"
 
 
-def _levels(values: np.ndarray) -> list[float]:
-    """Choose round contour levels that enclose all values, in nearly constant ratio."""
-    values = values[values > 0]
-    if not len(values):
-        return []
-    low, high = values.min(), values.max()
-    powers = 10.0 ** np.arange(np.floor(np.log10(low)), np.ceil(np.log10(high)) + 1)
-    rounds = (np.round(np.outer(powers, steps).ravel(), 12) for steps in _ROUND)
-    inside = next((r for r in rounds if ((low < r) & (r < high)).sum() >= _LINES), np.array([low, high]))
-    first, last = np.searchsorted(inside, low, "right") - 1, np.searchsorted(inside, high, "left")
-    return [float(k) for k in inside[max(first, 0) : last + 1]]
+def distortion_of(tables: Tables, camera: str | None = None) -> DistortionCurve:
+    """Return the distortion curve of a camera by radial distance, with a posteriori standard deviations."""
+    name, a = one_camera(tables.adjusted.block, camera), tables.adjusted
+    interior = a.unknowns.interior[name]
+    covariance = tables.covariance.of_interior(name, parameter_names(interior))
+    return distortion_curve(interior, a.block.sensors[name], covariance)
+
+
+def plot_distortion(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
+    """Draw radial distortion by distance from the principal point with its 95 % band, and the non-radial distortion."""
+    ax = axes_or_new(ax)
+    draw_distortion(ax, distortion_of(tables, camera))
+    return ax
+
+
+def draw_distortion(axes: Axes, curve: DistortionCurve, factor: float = 1.0) -> None:
+    """Draw radial distortion (um) with its 95 % band times `factor`, and the non-radial distortion."""
+    um = 1e3
+    if curve.sigma is not None:
+        half = um * NORMAL_95 * factor * curve.sigma
+        band = um * curve.radial - half, um * curve.radial + half
+        axes.fill_between(curve.r, *band, color="#9ecae1", label="95 % band", lw=0)
+    axes.plot(curve.r, um * curve.radial, "-", color="#08519c", label="radial")
+    axes.plot(curve.r, um * curve.other, "--", color="#d95f02", label="decentring, affinity (RMS)")
+    axes.axhline(0, color="0.6", lw=0.6)
+    axes.set(xlabel="distance from the principal point [mm]", ylabel="measured - ideal [µm]")
+    title(axes, "distortion")
+    axes.legend(fontsize=7)
+
+
+def plot_distortion_band(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
+    """Draw the half width of the 95 % band of the radial distortion.
+
+    In a plot of the curve the band is often thinner than the line.
+    """
+    ax, curve = axes_or_new(ax), distortion_of(tables, camera)
+    if curve.sigma is not None:
+        ax.plot(curve.r, 1e3 * NORMAL_95 * curve.sigma, "-", color="#08519c")
+    ax.set(xlabel="distance from the principal point [mm]", ylabel="95 % within +- [µm]", ylim=(0, None))
+    title(ax, "uncertainty of the radial distortion")
+    return ax
 
 
 # Block -----------------------------------------------------------------------------------------------------------
@@ -439,32 +450,6 @@ def plot_intersection_angles(tables: Tables, ax: Axes | None = None) -> Axes:
     return ax
 
 
-def plot_point_sigmas(tables: Tables, ax: Axes | None = None, *, unit: str = "m") -> Axes:
-    """Draw histograms of the standard deviations of object points by axis, up to the 99th percentile."""
-    ax, points = axes_or_new(ax), tables.object_points
-    sigma = points.loc[points["n_images"] > 0, [f"sigma_{a}_m" for a in AXES]].to_numpy()
-    known = sigma[np.isfinite(sigma) & (sigma > 0)]
-    if len(known):
-        low, high = np.percentile(known, [0.5, 99])
-        for k, (axis, line) in enumerate(zip(AXES, ("-", "--", ":"), strict=True)):
-            ax.hist(sigma[:, k], bins=np.geomspace(low, high, 40).tolist(), histtype="step", ls=line, label=axis)
-        log_ticks(ax)
-        ax.legend(fontsize=7)
-    ax.set(xlabel=f"sigma [{unit}]", ylabel="points")
-    title(ax, "standard deviations of points")
-    return ax
-
-
-def plot_rays(tables: Tables, ax: Axes | None = None) -> Axes:
-    """Draw the number of object points by number of rays."""
-    ax, most = axes_or_new(ax), 15
-    rays = np.minimum(np.bincount(tables.adjusted.structure.point), most)
-    ax.bar(np.arange(2, most + 1), np.bincount(rays, minlength=most + 1)[2:], color="tab:blue")
-    ax.set(xlabel=f"rays of a point ({most}: or more)", ylabel="points", yscale="log")
-    title(ax, "points by number of rays")
-    return ax
-
-
 def plot_overlap(tables: Tables, ax: Axes | None = None) -> Axes:
     """Draw the number of images that cover each cell of the ground; coordinates in metres."""
     ax = axes_or_new(ax)
@@ -484,92 +469,30 @@ def draw_overlap(ax: Axes, cover: Coverage, adjusted: Adjustment) -> None:
     title(ax, "overlap: images per cell of the ground")
 
 
-# Maximum number of drawn links per class, number of classes, number of highlighted weakest links.
-_LINKS, _CLASSES, WEAKEST = 2000, 5, 5
-# Maximum fraction of the plot covered by lines, width of the plot (points), minimum line width (points).
-_INK, _ACROSS, _THINNEST = 0.5, 200.0, 0.05
-
-
 def plot_links(tables: Tables, ax: Axes | None = None, *, unit: str = "m") -> Axes:
-    """Draw the image network in plan by common points: dark lines for strong links, the weakest in red.
+    """Draw the image network in plan: pairs of images with common points, strong links on top."""
+    from matplotlib.collections import LineCollection
 
-    Of a class of many links an even sample is drawn; title and legend state the fraction.
-    """
     ax, links = axes_or_new(ax), image_links(tables.adjusted)
-    draw_network(ax, np.asarray(tables.adjusted.unknowns.exterior.position)[:, :2], links,
-                 weak_links(tables.adjusted, links, WEAKEST))  # fmt: skip
+    station, order = np.asarray(tables.adjusted.unknowns.exterior.position)[:, :2], np.argsort(links.common)
+    ends = np.stack([station[links.first], station[links.second]], axis=1)[order]
+    drawn = LineCollection(list(ends), array=links.common[order], cmap="cividis_r", lw=0.8, rasterized=len(ends) > 2000)
+    ax.add_collection(drawn)
+    ax.figure.colorbar(drawn, ax=ax, shrink=0.8, label="common points")
+    ax.plot(*station.T, "o", ms=3, color="tab:blue")
     ax.set(xlabel=f"X [{unit}]", ylabel=f"Y [{unit}]")
+    title(ax, f"{len(ends)} pairs of images with common points")
+    ax.set_aspect("equal", adjustable="datalim")
     return ax
 
 
-def draw_network(axes: Axes, station: Float[np.ndarray, "n 2"], links: ImageLinks, weak: Sequence[WeakLink]) -> None:
-    """Draw links between stations by class of strength."""
-    limits = strength_classes(links.common)
-    lines = []
-    for k, low in enumerate(limits):
-        high = limits[k + 1] if k + 1 < len(limits) else np.inf
-        members = np.flatnonzero((links.common >= low) & (links.common < high))
-        one_in = max(1, -(-len(members) // _LINKS))
-        name = f"{low} or more" if np.isinf(high) else f"{low} to {high - 1}"
-        strength = k / max(len(limits) - 1, 1)
-        lines.append((members[::one_in], strength, name if one_in == 1 else f"{name}: 1 in {one_in}"))
-    way = np.linalg.norm(station[links.second] - station[links.first], axis=1)
-    size = max(float(np.ptp(station, axis=0).max()), 1e-9)
-    ink = sum(float(way[members].sum()) * (0.3 + 2 * strength) for members, strength, _ in lines) / (size * _ACROSS)
-    thinner = min(1.0, _INK / ink) if ink > 0 else 1.0
-    for members, strength, name in lines:
-        ends = np.stack(
-            [station[links.first[members]], station[links.second[members]], np.full((len(members), 2), np.nan)], axis=1
-        )
-        width = max(_THINNEST, thinner * (0.3 + 2 * strength))
-        axes.plot(*ends.reshape(-1, 2).T, "-", color=str(0.85 - 0.75 * strength), lw=width, label=name)
-    for k, w in enumerate(weak):
-        text = "weakest" if k == 0 else None
-        axes.plot(*station[[w.first, w.second]].T, "--", color="tab:red", lw=1.2, label=text)
-    axes.plot(*station.T, "o", ms=3, color="tab:blue")
-    axes.legend(fontsize=6, title="common points", title_fontsize=6, loc="upper left", bbox_to_anchor=(1.0, 1.0))
-    shown, n = sum(len(members) for members, _, _ in lines), len(links.common)
-    title(axes, f"images and their common points{f': {shown} of {n} links' if shown < n else ''}")
-    axes.set_aspect("equal", adjustable="datalim")
-
-
-def strength_classes(common: np.ndarray) -> list[int]:
-    """Return lower limits of classes of links by common points, in approximately constant ratio."""
-    return sorted({int(v) for v in np.geomspace(1, max(common.max() / 2, 1), _CLASSES).round()})
-
-
-def plot_link_strength(tables: Tables, ax: Axes | None = None) -> Axes:
-    """Draw the histogram of the number of common points per pair of images."""
-    ax, common = axes_or_new(ax), image_links(tables.adjusted).common
-    edges = np.unique(np.geomspace(1, max(common.max(), 2) + 1, 16).round())
-    number, _ = np.histogram(common, edges)
-    ax.bar(edges[:-1], number, width=np.diff(edges), align="edge", color="tab:blue", edgecolor="white", lw=0.5)
-    ax.set(xscale="log", xlabel="common points of two images", ylabel="pairs")
-    title(ax, "strength of links")
-    return ax
-
-
-def plot_convergence(tables: Tables, ax: Axes | None = None, *, steps: bool = False) -> Axes:
-    """Draw sigma naught by iteration, or with `steps` the step lengths in sigmas. Raises InputError if unknown."""
+def plot_convergence(tables: Tables, ax: Axes | None = None) -> Axes:
+    """Draw sigma naught by iteration. Raises InputError if unknown."""
     if tables.adjusted.history is None:
         raise InputError("this adjustment has no iteration history; adjust the block to draw its convergence")
-    ax, table = axes_or_new(ax), tables.convergence
-    ax.locator_params(axis="x", integer=True)
-    if steps:
-        table = table.dropna(subset="length")
-        length, taken = table["length"].to_numpy(float), (table["taken"] == "yes").to_numpy()
-        k = np.arange(1, len(length) + 1)
-        ax.semilogy(k, length, "-", lw=1, color="tab:blue")
-        ax.semilogy(k[taken], length[taken], "o", ms=4, color="tab:blue", label="accepted")
-        if not taken.all():
-            ax.semilogy(k[~taken], length[~taken], "o", ms=5, mfc="none", color="tab:orange", label="rejected")
-        ax.axhline(TOLERANCE, ls="--", color="0.4", label="tolerance")
-        ax.set(xlabel="step", ylabel="largest move [sigma]")
-        title(ax, "step length")
-        ax.legend(fontsize=7)
-        return ax
-    sigma0 = table["sigma0"].to_numpy(float)
+    ax, sigma0 = axes_or_new(ax), tables.convergence["sigma0"].to_numpy(float)
     ax.plot(np.arange(len(sigma0)), sigma0, "o-", ms=4, color="tab:blue")
+    ax.locator_params(axis="x", integer=True)
     low, high = np.nanmin(sigma0), np.nanmax(sigma0)
     if high > 3.0 * low:
         ax.set_yscale("log")

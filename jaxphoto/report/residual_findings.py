@@ -7,35 +7,19 @@ import numpy as np
 import pandas as pd
 import scipy
 
+from jaxphoto import statistics
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import camera_words, few
-from jaxphoto.observations import PRIORS, AbstractObservations, Correlated
+from jaxphoto.observations import PRIORS, Correlated
 from jaxphoto.procedures.adjust import ABSURD
 from jaxphoto.procedures.blunder_causes import InflatedComponent, coordinate_mistakes, is_mirrored
 from jaxphoto.procedures.snooping import SEVERAL, Snooped, mostly_rejected, rejected_images
 from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words, symbol
 from jaxphoto.report.formatting import in_file_unit
 from jaxphoto.report.tables import Tables
-from jaxphoto.statistics import (
-    DELTA0,
-    LEVEL,
-    MAX_GROUPS,
-    SIGNIFICANT_RATIO,
-    EffectTerm,
-    Suspect,
-    SystematicEffect,
-    TermEstimate,
-    VarianceComponents,
-    expected_residual_scale,
-    global_test,
-    group_factors,
-    largest_interior_effects,
-    largest_mdbs,
-    multiple_outlier_test,
-)
 from jaxphoto.unknowns import Weighted
 
 ANOTHER_UNIT = 0.1
@@ -64,21 +48,23 @@ _HIDDEN = 10.0
 def residual_findings(tables: Tables) -> Iterator[Finding]:
     """Yield the tests of sigma naught, of single residuals and of systematic effects."""
     yield from _global_test(tables)
-    fits = global_test(tables.adjusted, tables.redundancy).sigma <= ABSURD
+    fits = statistics.global_test(tables.adjusted, tables.redundancy).sigma <= ABSURD
     effects, suspects = list(_systematic(tables, fits)), tables.blunders.suspects
     # Report effects that are more certain than the worst suspect first: they imitate blunders in many observations. If
     # sigma naught is absurd, first-order theory cannot separate the two.
-    first = [e for e in effects if e.chance < _chance_of_the_worst(tables)] if suspects and fits else []
+    worst_w = max((abs(s.w) for s in suspects), default=0.0)
+    by_chance = tables.blunders.n * float(scipy.special.erfc(worst_w / np.sqrt(2)))
+    first = [e for e in effects if e.chance < by_chance] if suspects and fits else []
     blunders = list(_blunders(tables, tables.culprits)) if first else []
     worst = min((SEVERITIES.index(f.severity) for f in blunders), default=len(SEVERITIES) - 1)
     for effect in first:
         severity = SEVERITIES[min(SEVERITIES.index(effect.severity), worst)]
-        yield _systematic_finding(effect, severity)
+        yield effect.finding(severity)
     terms = [pair for effect in first[:1] for pair in effect.terms]
     yield from _blunders(
-        tables, multiple_outlier_test(tables.adjusted, tables.blunders, terms) if terms else tables.culprits
+        tables, statistics.multiple_outlier_test(tables.adjusted, tables.blunders, terms) if terms else tables.culprits
     )
-    yield from (_systematic_finding(e, e.severity) for e in effects if all(e is not one for one in first))
+    yield from (e.finding(e.severity) for e in effects if all(e is not one for one in first))
 
 
 def contradictions(tables: Tables) -> Iterator[Finding]:
@@ -100,24 +86,22 @@ def _priors_of_lens_type(block: Block) -> bool:
 
 def _global_test(tables: Tables) -> Iterator[Finding]:
     """Compare sigma naught with its expectation, and find the groups of observations that cause a deviation."""
-    whole = global_test(tables.adjusted, tables.redundancy)
+    whole = statistics.global_test(tables.adjusted, tables.redundancy)
     if whole.redundancy <= 0:
-        yield Finding("no_redundancy", "warning", hint="Add observations")
+        yield Finding("no_redundancy", "warning")
         return
-    tested = group_factors(tables.adjusted, tables.redundancy)
-    factors = [f for f in tested if f.p_value < LEVEL / len(tested)]
-    if whole.p_value >= LEVEL:
+    tested = statistics.group_factors(tables.adjusted, tables.redundancy)
+    factors = [f for f in tested if f.p_value < statistics.LEVEL / len(tested)]
+    if whole.p_value >= statistics.LEVEL:
         # Test the groups separately: a few observations among many do not affect sigma naught.
         for f in factors:
             p = {"p": p_words(f.p_value)}
             if not f.group.startswith(PRIORS):
                 factor, size = (1 / f.sigma, "large") if f.sigma < 1 else (f.sigma, "small")
-                hint = "Correct them (--weights estimates them)"
                 numbers = p | {"factor": factor, "size": size}
-                yield Finding("group_sigma", "warning", f.group.replace("_", " "), f.sigma, 1.0, hint, numbers)
+                yield Finding("group_sigma", "warning", f.group.replace("_", " "), f.sigma, 1.0, numbers=numbers)
             elif f.sigma < 1 and not (f.group == PRIORS and _priors_of_lens_type(tables.adjusted.block)):
-                hint = "If it was estimated from the same images, remove it: sigmas are too small"
-                yield Finding("prior_counted_twice", "warning", value=f.sigma, limit=1.0, hint=hint, numbers=p)
+                yield Finding("prior_counted_twice", "warning", value=f.sigma, limit=1.0, numbers=p)
         return
     groups = ", ".join(f"{f.group.replace('_', ' ')} {f.sigma:.3g}" for f in factors)
     numbers = {"p": p_words(whole.p_value), "groups": f"; by group: {groups}" if groups else ""}
@@ -127,27 +111,22 @@ def _global_test(tables: Tables) -> Iterator[Finding]:
         several = sum(n > 0 for n in tables.adjusted.n_observations.values()) > 1
         unit = whole.sigma < ANOTHER_UNIT and several
         code, severity = ("sigma0_unit", "error") if unit else ("sigma0_small", "warning")
-        hint = "Correct the standard deviations: unless all are too large by one factor, weights are wrong"
     elif whole.sigma <= NOTHING_FITS:
-        code, hint = "sigma0_large", "Standard deviations are too small, or there are blunders or an incomplete model"
+        code = "sigma0_large"
     else:
         code, severity = "sigma0_contradiction", "error"
-        hint = (
-            "Check approximate values, units, point ids and the largest residuals; jaxphoto adjust --snoop rejects "
-            "blunders"
-        )
-    yield Finding(code, severity, value=whole.factor**0.5, limit=whole.expected**0.5, hint=hint, numbers=numbers)
+    yield Finding(code, severity, value=whole.factor**0.5, limit=whole.expected**0.5, numbers=numbers)
 
 
 def stretch_findings(adjusted: Adjustment) -> Iterator[Finding]:
     """Yield cameras whose distortion scales residuals, so that the expected sigma naught differs from 1."""
-    for camera, factor in expected_residual_scale(adjusted).items() if adjusted.redundancy > 0 else ():
+    for camera, factor in statistics.expected_residual_scale(adjusted).items() if adjusted.redundancy > 0 else ():
         if abs(factor - 1) > _STRETCHED:
             hint = f'Set residuals = "measured" in [cameras.{camera}]'
             yield Finding("stretched", "note", camera_words(camera), factor, 1.0, hint)
 
 
-def _blunders(tables: Tables, suspects: Sequence[Suspect]) -> Iterator[Finding]:
+def _blunders(tables: Tables, suspects: Sequence[statistics.Suspect]) -> Iterator[Finding]:
     """Yield the most likely blunders.
 
     A blunder is an error if it is far above the critical value or shifts the interior orientation. Otherwise it is a
@@ -163,29 +142,24 @@ def _blunders(tables: Tables, suspects: Sequence[Suspect]) -> Iterator[Finding]:
             "effect": f"; it moves {symbol(name)} by {moved:.1g} sigma" if moved > _REPORTED else "",
         }  # fmt: skip
         severity: Severity = "error" if severe else "warning"
-        yield Finding("blunder", severity, s.words, factor * s.error, limit, "Check this observation", numbers)
+        yield Finding("blunder", severity, s.words, factor * s.error, limit, numbers=numbers)
     if explained := len(tables.blunders.suspects) - len(judged):
         yield Finding("explained_suspects", "note", value=explained, limit=limit)
     if len(judged) > _SHOWN:
         severity = "error" if any(severe for severe, *_ in judged) else "warning"
-        hint = "jaxphoto adjust --snoop rejects blunders"
         numbers = {"n": tables.blunders.n}
-        yield Finding("many_blunders", severity, value=len(judged), limit=limit, hint=hint, numbers=numbers)
+        yield Finding("many_blunders", severity, value=len(judged), limit=limit, numbers=numbers)
 
 
-def _effect(tables: Tables, suspect: Suspect) -> tuple[str, float]:
+def _effect(tables: Tables, suspect: statistics.Suspect) -> tuple[str, float]:
     """Return the interior parameter that the error of a suspect shifts most, and the shift in a posteriori sigmas."""
     moved = {
-        parameter: float(np.atleast_2d(of[suspect.group])[suspect.number, suspect.row]) * abs(suspect.w) / DELTA0
+        parameter: float(np.atleast_2d(of[suspect.group])[suspect.number, suspect.row])
+        * abs(suspect.w)
+        / statistics.DELTA0
         for parameter, of in tables.undetected.interior.items()
     }
     return max(((p, v) for p, v in moved.items() if np.isfinite(v)), key=lambda item: item[1], default=("", 0.0))
-
-
-def _chance_of_the_worst(tables: Tables) -> float:
-    """Return the p-value of the largest normalised residual among all (Bonferroni)."""
-    w = max(abs(s.w) for s in tables.blunders.suspects)
-    return tables.blunders.n * float(scipy.special.erfc(w / np.sqrt(2)))
 
 
 class _Effect(NamedTuple):
@@ -198,21 +172,21 @@ class _Effect(NamedTuple):
     value: float
     limit: float
     numbers: dict[str, Any]
-    terms: tuple[tuple[SystematicEffect, EffectTerm], ...]
+    terms: tuple[tuple[statistics.SystematicEffect, statistics.EffectTerm], ...]
     """Terms that explain most of the effect."""
 
-
-def _systematic_finding(effect: _Effect, severity: Severity) -> Finding:
-    return Finding("systematic", severity, effect.subject, effect.value, effect.limit, numbers=effect.numbers)
+    def finding(self, severity: Severity) -> Finding:
+        """Return the effect as a finding."""
+        return Finding("systematic", severity, self.subject, self.value, self.limit, numbers=self.numbers)
 
 
 def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
     """Yield significant systematic effects by increasing p-value; effects of cameras only if `fits`."""
-    level = LEVEL / max(len(tables.tested_trends), 1)
+    level = statistics.LEVEL / max(len(tables.tested_trends), 1)
     found = (t for t in tables.tested_trends if t.p_value < level and (fits or not t.pattern.camera))
     for t in sorted(found, key=lambda t: t.p_value ** (_SIMILAR if t.pattern.begins else 1.0)):
         factor, unit = in_file_unit(t.pattern.unit)
-        detail, likely, spoilt = "", list[TermEstimate](), False
+        detail, likely, spoilt = "", list[statistics.TermEstimate](), False
         if t.size > 0 and unit:
             detail = f", size {factor * t.size:.2g} {unit} ({t.size / t.sigma:.2g} sigma)"
         together = t.significant_terms
@@ -230,7 +204,7 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
                 detail += f"; {path} would move by {moved:.1f} sigma"
         elif t.pattern.camera:
             detail += ": no single common term explains most of it; try a model with more terms (docs/stability.md)"
-        elif several := [h for h in t.hints if abs(h.amount) > SIGNIFICANT_RATIO * h.sigma][:_SHOWN]:
+        elif several := [h for h in t.hints if abs(h.amount) > statistics.SIGNIFICANT_RATIO * h.sigma][:_SHOWN]:
             detail += f", each alone {_terms(t.pattern, several)}"
         # Count the suspects explained by the terms: these are not blunders.
         most = t.matching_blunders >= _SHOWN and t.matching_blunders > len(tables.blunders.suspects) / 2
@@ -242,7 +216,7 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
         yield _Effect(chance, severity, subject, factor * t.size, _VISIBLE * factor * t.sigma, numbers, terms)
 
 
-def _terms(pattern: SystematicEffect, likely: list[TermEstimate]) -> str:
+def _terms(pattern: statistics.SystematicEffect, likely: list[statistics.TermEstimate]) -> str:
     """Describe the likely terms with their estimates, and the cure."""
     factor, unit = in_file_unit(pattern.unit)
     amounts = (f" {factor * h.amount:+.3g} +- {factor * h.sigma:.2g} {unit}".rstrip() for h in likely)
@@ -257,16 +231,16 @@ def _terms(pattern: SystematicEffect, likely: list[TermEstimate]) -> str:
 def reliability_findings(tables: Tables) -> Iterator[Finding]:
     """Yield points with two rays, external reliability, and observations with large MDBs."""
     adjusted = tables.adjusted
-    if (n := len(adjusted.block.sensors)) > MAX_GROUPS:
-        yield Finding("not_tested_by_camera", "note", value=n, limit=MAX_GROUPS)
+    if (n := len(adjusted.block.sensors)) > statistics.MAX_GROUPS:
+        yield Finding("not_tested_by_camera", "note", value=n, limit=statistics.MAX_GROUPS)
     rays = np.bincount(adjusted.structure.point, minlength=len(adjusted.block.points))
     if two := int((rays == 2).sum()):
         yield Finding("two_rays", "note", value=two, numbers={"n": len(rays)})
-    if felt := [f for f in largest_interior_effects(adjusted, tables.undetected) if f.moved > _MOVED]:
+    if felt := [f for f in statistics.largest_interior_effects(adjusted, tables.undetected) if f.moved > _MOVED]:
         subject = ", ".join(f"{symbol(f.parameter)} by up to {f.moved:.1f} sigma ({f.words})" for f in felt)
         yield Finding("external_reliability", "note", subject, max(f.moved for f in felt), _MOVED)
     yield from _common_biases(tables)
-    for hidden in largest_mdbs(adjusted, tables.redundancy):
+    for hidden in statistics.largest_mdbs(adjusted, tables.redundancy):
         if hidden.group != IMAGE_POINTS and hidden.mdb > _HIDDEN * hidden.sigma:
             factor, unit = in_file_unit(hidden.unit)
             code = "mdb" if np.isfinite(hidden.mdb) else "unchecked"
@@ -277,16 +251,18 @@ def reliability_findings(tables: Tables) -> Iterator[Finding]:
 def _common_biases(tables: Tables) -> Iterator[Finding]:
     """Yield the MDB of a bias common to all rows of a group, and its effect on the interior orientation."""
     for t in (t for t in tables.tested_trends if t.pattern.group):
-        worst: tuple[float, str, TermEstimate] | None = None
+        worst: tuple[float, str, statistics.TermEstimate] | None = None
         for h in (h for h in t.hints if h.amount != 0.0):
             for path, moved in h.moves.items():
-                size = abs(moved / h.amount) * DELTA0 * h.sigma
+                size = abs(moved / h.amount) * statistics.DELTA0 * h.sigma
                 worst = max(worst or (0.0, "", h), (size, path, h), key=lambda w: w[0])
         if worst is not None and worst[0] > _MOVED:
             size, path, h = worst
             factor, unit = in_file_unit(t.pattern.unit)
             numbers = {"term": h.term.name, "unit": unit, "parameter": path, "moved": size}
-            yield Finding("common_bias", "note", t.pattern.what, factor * DELTA0 * h.sigma, _MOVED, numbers=numbers)
+            yield Finding(
+                "common_bias", "note", t.pattern.what, factor * statistics.DELTA0 * h.sigma, _MOVED, numbers=numbers
+            )
 
 
 # Rejected observations -------------------------------------------------------------------------------------------
@@ -335,54 +311,47 @@ def _common(snooped: Snooped, block: Block) -> Iterator[Finding]:
     """Find rejected rows of a group (except image points) with a common bias along an axis, overall or in a strip."""
     for name, rows in block.named_observations.items():
         left = [s for s in snooped.left_out if s.group == name]
-        if name != IMAGE_POINTS and not isinstance(rows, Correlated) and len(left) >= SEVERAL:
-            yield from _common_of(name, rows, left, block)
-
-
-def _common_of(name: str, rows: AbstractObservations, left: list[Suspect], block: Block) -> Iterator[Finding]:
-    axes = rows.axis_of_numbers
-    strips = np.broadcast_to(rows.names_of("image", block.image_strip), axes.shape)
-    of_strips = sorted({(str(axes[s.number, s.row]), str(strips[s.number, s.row])) for s in left})
-    reported: set[str] = set()
-    for axis, strip in [*((axis, None) for axis in dict.fromkeys(a for a, _ in of_strips)), *of_strips]:
-        part = (axes == axis) & ((strips == strip) if strip is not None else True)
-        own = [s for s in left if part[s.number, s.row]]
-        error, sigma = (np.array([getattr(s, field) for s in own]) for field in ("error", "sigma"))
-        mean = float(np.average(error, weights=sigma**-2.0))
-        scatter = float(np.sqrt(np.mean(((error - mean) / sigma) ** 2)))
-        if axis not in reported and len(own) >= SEVERAL and len(own) > part.sum() / 2 and scatter < _COMMON:
-            # A bias of all strips is reported only once.
-            reported |= {axis} if strip is None else set()
-            factor, unit = in_file_unit(own[0].unit)
-            subject = f"{name.replace('_', ' ')}{f' in strip {strip}' if strip else ''} along {axis}"
-            numbers = {"n": len(own), "bias": factor * mean, "unit": unit}
-            hint = "Estimate it (such as a shift), or correct it at its source"
-            yield Finding("rejected_bias", "warning", subject, float(part.sum()), hint=hint, numbers=numbers)
+        if name == IMAGE_POINTS or isinstance(rows, Correlated) or len(left) < SEVERAL:
+            continue
+        axes = rows.axis_of_numbers
+        strips = np.broadcast_to(rows.names_of("image", block.image_strip), axes.shape)
+        of_strips = sorted({(str(axes[s.number, s.row]), str(strips[s.number, s.row])) for s in left})
+        reported: set[str] = set()
+        for axis, strip in [*((axis, None) for axis in dict.fromkeys(a for a, _ in of_strips)), *of_strips]:
+            part = (axes == axis) & ((strips == strip) if strip is not None else True)
+            own = [s for s in left if part[s.number, s.row]]
+            if axis in reported or len(own) < SEVERAL or len(own) <= part.sum() / 2:
+                continue
+            error, sigma = (np.array([getattr(s, field) for s in own]) for field in ("error", "sigma"))
+            mean = float(np.average(error, weights=sigma**-2.0))
+            if float(np.sqrt(np.mean(((error - mean) / sigma) ** 2))) < _COMMON:
+                # A bias of all strips is reported only once.
+                reported |= {axis} if strip is None else set()
+                factor, unit = in_file_unit(own[0].unit)
+                subject = f"{name.replace('_', ' ')}{f' in strip {strip}' if strip else ''} along {axis}"
+                numbers = {"n": len(own), "bias": factor * mean, "unit": unit}
+                yield Finding("rejected_bias", "warning", subject, float(part.sum()), numbers=numbers)
 
 
 def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
     """Find images and groups with too many rejections for isolated errors."""
     most = rejected_images(snooped, block)
-    mirrored = [k for k in most if is_mirrored(snooped, block, k)]
-    for which, hint in (
-        (mirrored, "They fit mirrored: x and y are exchanged, or one of them has the wrong sign"),
-        ([k for k in most if k not in mirrored], "Check its point names, axes, camera and station, or remove it"),
-    ):
-        if images := [f"{block.images[k]} ({most[k][0]} of {most[k][1]})" for k in which]:
+    mirrored = "They fit mirrored: x and y are exchanged, or one has the wrong sign"
+    fits = {k: is_mirrored(snooped, block, k) for k in most}
+    for hint, which in ((mirrored, True), ("", False)):
+        if images := [f"{block.images[k]} ({n} of {of})" for k, (n, of) in most.items() if fits[k] is which]:
             yield Finding("rejected_images", "error", few(images), len(images), hint=hint)
     mistakes = coordinate_mistakes(snooped, block)
     for name, counts in mostly_rejected(snooped, block).items():
         many = ", ".join(f"{n} of {of} in {axis}" for axis, (n, of) in counts.items())
-        hint = "Check their units, axes, names and signs, and the fixed values"
-        if name in mistakes:
-            hint = f"They fit if {mistakes[name]}: correct them at their source"
+        hint = f"They fit if {mistakes[name]}: correct them at their source" if name in mistakes else ""
         yield Finding("rejected_group", "error", f"{name.replace('_', ' ')}, {many}", hint=hint)
 
 
 # Variance components ---------------------------------------------------------------------------------------------
 
 
-def component_tables(components: VarianceComponents) -> dict[str, pd.DataFrame]:
+def component_tables(components: statistics.VarianceComponents) -> dict[str, pd.DataFrame]:
     """Return the tables variance_components and variance_component_correlation by file name.
 
     Columns: group, observations, redundancy, factor, sigma_factor, degrees_of_freedom, supported; and group_a, group_b,
@@ -399,16 +368,16 @@ def component_tables(components: VarianceComponents) -> dict[str, pd.DataFrame]:
     return {"variance_components": pd.DataFrame(columns), "variance_component_correlation": correlation}
 
 
-def component_findings(components: VarianceComponents, blunders: Sequence[InflatedComponent] = ()) -> list[Finding]:
+def component_findings(
+    components: statistics.VarianceComponents, blunders: Sequence[InflatedComponent] = ()
+) -> list[Finding]:
     """Report components caused by blunders, missing convergence, and groups whose component is not estimable."""
     found = []
     for component in blunders:
-        hint = "Adjust with --snoop as well: blunders inflate variance components"
         numbers = {"words": few(list(component.words))}
         found.append(
-            Finding("component_blunder", "error", component.label, component.factor, component.without, hint, numbers)
+            Finding("component_blunder", "error", component.label, component.factor, component.without, numbers=numbers)
         )
     if not components.converged:
-        hint = "Estimate them for fewer groups"
-        found.append(Finding("components_not_converged", "warning", value=components.iterations, hint=hint))
+        found.append(Finding("components_not_converged", "warning", value=components.iterations))
     return found + [Finding("component", "warning", sentence) for sentence in components.warnings.values()]

@@ -1,5 +1,6 @@
 """The result folder of an adjustment: tables, summary.json and the report."""
 
+import itertools
 import json
 import math
 import time
@@ -18,8 +19,8 @@ from jaxphoto.camera import RATES, InteriorOrientation, Sensor, get_parameter, m
 from jaxphoto.compiling.freed_memory import return_freed_memory
 from jaxphoto.errors import InputError, camera_words, counted
 from jaxphoto.observations import AXES
-from jaxphoto.report import distortion, plots
-from jaxphoto.report.block_plot import block_view, block_words, plot_block
+from jaxphoto.report import plots
+from jaxphoto.report.block_plot import block_words, plot_block
 from jaxphoto.report.findings import Verdict, as_sentence, p_words
 from jaxphoto.report.formatting import (
     check_table_format,
@@ -42,19 +43,12 @@ from jaxphoto.report.page import (
     versions,
 )
 from jaxphoto.report.tables import Tables, check_spread, recovery_spread, side_by_side, with_correlated_sigma
-from jaxphoto.statistics import (
-    LEAST_CHECK_POINTS,
-    LEAST_CHECKED,
-    LEVEL,
-    ComponentAccuracy,
-    PositionalAccuracy,
-    global_test,
-)
+from jaxphoto.statistics import LEAST_CHECKED, LEVEL, global_test
 from jaxphoto.statistics.block_geometry import format_coverage
 from jaxphoto.writing import whole_folder
 
 _TABLES = (
-    "interior", "exterior", "object_points", "residuals", "trends", "check_points", "positional_accuracy",
+    "interior", "exterior", "object_points", "residuals", "trends", "check_points",
     "correlation", "correlation_summary", "correlation_ground", "sigma_map", "convergence",
 )  # fmt: skip
 # Additional tables if the files of the block are in an EPSG system.
@@ -69,7 +63,6 @@ _EFFECTS = {"pattern": "systematic effect", "freedom": "degrees of freedom", "sh
 # Classes in the table of object points: minimum number of rays of each class.
 _RAYS = (2, 3, 4, 6, 11, 21)
 _SMALL_DEG = 2.0
-_STANDARD = "ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2 (2023)"
 
 
 # Files -----------------------------------------------------------------------------------------------------------
@@ -159,7 +152,6 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
             for axis, n, mean, rmse, most, _ in check_spread(tables.check_points).itertuples(index=False)
             if n
         },
-        "positional_accuracy": accuracy_sentences(tables.tested_accuracy),
         "seconds": rounded(seconds),
         "versions": versions(),
     }
@@ -173,13 +165,10 @@ def write_study(
     summary: Mapping[str, Any],
     record: CommandRecord,
     tables: Mapping[str, pd.DataFrame] = MappingProxyType({}),
-    figures: Mapping[str, Any] = MappingProxyType({}),
 ) -> None:
-    """Write tables (CSV), figures (PNG), report.html and summary.json of a study into the folder `work`."""
+    """Write tables (CSV), report.html and summary.json of a study into the folder `work`."""
     for name, table in tables.items():
         table.to_csv(work / f"{name}.csv", index=False)
-    for name, figure in figures.items():
-        figure.savefig(work / f"{name}.png")
     text = page(title, [*parts, *provenance(record)], verdict)
     (work / "report.html").write_text(text, encoding="utf-8")
     write_summary({**summary, "versions": versions()}, work)
@@ -277,18 +266,17 @@ def adjustment_sections(
 ) -> Iterator[Part]:
     """Yield all sections of an adjustment. `start`: initial camera; `factor`: factor of its standard deviations."""
     a, cameras = tables.adjusted, plotted_cameras(tables)
+    mapped = [camera for camera in tables.sigma_maps if camera in cameras]
     yield from _interior(tables, cameras, start, factor)
-    if mapped := [camera for camera in tables.sigma_maps if camera in cameras]:
+    if mapped:
         yield Heading("Distortion")
         yield Paragraph("Measured minus ideal image coordinates along the radius, for the adjusted c.")
         for camera in mapped:
-            curve, words = distortion.distortion_of(tables, camera), camera_words(camera)
+            curve, words = plots.distortion_of(tables, camera), camera_words(camera)
+            draw, band = partial(plots.draw_distortion, curve=curve, factor=factor), plots.plot_distortion_band
             yield [
-                Plot(
-                    partial(distortion.draw_distortion, curve=curve, factor=factor),
-                    f"distortion of {words} by distance",
-                ),
-                Plot(partial(distortion.plot_distortion_band, tables, camera), f"95 % band for {words}"),
+                Plot(draw, f"distortion of {words} by distance"),
+                Plot(partial(band, tables, camera), f"95 % band for {words}"),
             ]
         yield Heading("Projection uncertainty over the image format")
         yield Paragraph(
@@ -296,50 +284,52 @@ def adjustment_sections(
             "(sigma_map.csv). At infinity the error in c propagates fully; at the object distance it is partly "
             "compensated by the camera position."
         )
-        for camera in mapped:
-            sensor = a.block.sensors[camera]
-            yield [Plot(partial(plots.draw_sigma_map, sensor=sensor, one=one), _map_words(sensor, one))
-                   for one in tables.sigma_maps[camera]]  # fmt: skip
+        for one in (one for camera in mapped for one in tables.sigma_maps[camera]):
+            sensor, worst = a.block.sensors[one.camera], one.worst[np.isfinite(one.worst)]
+            px = worst / sensor.pixel_mm
+            spread = f"median {np.median(px):.2g} px, worst {px.max():.2g} px" if len(px) else "unknown"
+            words = f"{camera_words(one.camera)}: sigma {plots.distance_words(one.distance_m)}, {spread}"
+            yield [Plot(partial(plots.draw_sigma_map, sensor=sensor, one=one), words)]
     if tables.truth:
-        recovery = tables.recovery
         yield Heading("Recovery of the true values")
         yield Paragraph(
             "Estimate minus truth in standard deviations (recovery.csv): an RMS of about 1, and 5 % beyond 2, if the "
             "model of the adjustment is that of the simulation."
         )
-        yield recovery_spread(recovery)
-        yield recovery[recovery["parameter"].str.startswith("interior[")]
+        yield recovery_spread(tables.recovery)
+        yield tables.recovery[tables.recovery["parameter"].str.startswith("interior[")]
     if len(tables.georeferencing):
-        yield Heading("Mounts and strips")
-        yield tables.georeferencing
+        yield from (Heading("Mounts and strips"), tables.georeferencing)
     yield Heading("Block")
     yield [Plot(partial(plot_block, a), block_words(a.block), 4.2)]
-    if (view := block_view(a, tables.covariance)) is not None:
-        yield view
     yield from _residuals(tables, cameras)
     yield from points_section(tables, unit)
     yield from _check_points(tables)
     yield Heading("Exterior orientation")
     yield [Plot(partial(plots.plot_error_ellipses, tables, unit=unit), "error ellipses of projection centres", 4)]
     yield tables.exterior
-    yield from _correlations(tables)
+    if len(summary := tables.correlation_summary):
+        yield Heading("Correlation of exterior and interior orientation over the images")
+        yield Paragraph("The largest absolute correlation over the images; means are in correlation_summary.csv.")
+        yield side_by_side(summary, ["camera", "exterior"], "interior", "max_abs_rho")
+    ground = tables.correlation_ground
+    if len(ground := ground[ground["sigma_m"] > 0]):
+        yield Heading("Correlation of the interior orientation and the ground as a whole")
+        ground = ground.assign(ground=ground["ground"].str.replace("_", " "))
+        yield side_by_side(ground, ["camera", "ground", "sigma_m"], "parameter", "rho")
     if len(tables.convergence):
         yield Heading("Convergence")
         yield Paragraph(convergence_words(a))
-        yield [
-            Plot(partial(plots.plot_convergence, tables), "sigma naught before each step and at the end", 3),
-            Plot(partial(plots.plot_convergence, tables, steps=True), "length of each step and tolerance", 3),
-        ]
+        yield [Plot(partial(plots.plot_convergence, tables), "sigma naught before each step and at the end", 3)]
         yield tables.convergence.tail(_STEPS).rename(columns={"length": "step in sigmas"})
 
 
 def plotted_cameras(tables: Tables) -> list[str]:
     """Return the cameras to plot; of many, those with the most image points."""
-    block, structure = tables.adjusted.block, tables.adjusted.structure
-    cameras, of_image = list(tables.adjusted.unknowns.interior), np.array(block.image_camera)
-    n_points = np.bincount(structure.image, minlength=len(of_image))
-    most = sorted(cameras, key=lambda camera: -int(n_points[of_image == camera].sum()))[:_PLOTTED]
-    return [camera for camera in cameras if camera in most]
+    of_image = pd.Series(tables.adjusted.block.image_camera)
+    most = of_image.iloc[tables.adjusted.structure.image].value_counts().index[:_PLOTTED]
+    cameras = list(tables.adjusted.unknowns.interior)
+    return [camera for camera in cameras if len(cameras) <= _PLOTTED or camera in most]
 
 
 def interior_table(tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0) -> pd.DataFrame:
@@ -348,76 +338,60 @@ def interior_table(tables: Tables, start: InteriorOrientation | None = None, fac
     rows = []
     for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
         name, pixel, estimated = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma"] > 0
-        in_px = (
-            plus_minus(p["value"] / pixel, p["sigma_correlated"] / pixel) if estimated and name.endswith("_mm") else ""
-        )
+        correlated, in_mm = p["sigma_correlated"], estimated and name.endswith("_mm")
         rows.append({
             "camera": p["camera"], "parameter": name,
             "initial": f"{float(get_parameter(start, name)):.6g}" if start and name in parameter_names(start) else "",
             "value": with_sigma(p["value"], p["sigma"]), "sigma": of_sigma(p["sigma"]) if estimated else "fixed",
-            "sigma (correlated residuals)": of_sigma(p["sigma_correlated"]) if estimated and factor > 1 else "",
-            "unit": p["unit"], "in pixels": in_px, "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
+            "sigma (correlated residuals)": of_sigma(correlated) if estimated and factor > 1 else "",
+            "unit": p["unit"], "in pixels": plus_minus(p["value"] / pixel, correlated / pixel) if in_mm else "",
+            "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
         })  # fmt: skip
-    shown = pd.DataFrame(rows)
-    several = len(tables.adjusted.unknowns.interior) > 1
-    return shown.drop(columns=[c for c in shown if not shown[c].any() or (c == "camera" and not several)])
+    shown = without_empty(pd.DataFrame(rows))
+    return shown if len(tables.adjusted.unknowns.interior) > 1 else shown.drop(columns="camera")
 
 
 def _interior(
     tables: Tables, cameras: Sequence[str], start: InteriorOrientation | None, factor: float
 ) -> Iterator[Part]:
-    block = tables.adjusted.block
     yield Heading("Interior orientation")
     yield interior_table(tables, start, factor)
     yield Paragraph(
         "Lengths in mm, x to the right and y up from the centre of the format. Standard deviations are a posteriori "
         f"(times sigma naught); correlations refer to the rotations {tables.rotations.replace('_', ', ')}."
     )
-    yield from assumed_pixels(block.sensors)
+    yield from assumed_pixels(tables.adjusted.block.sensors)
     for camera in cameras:
-        reached = format_coverage(tables.adjusted, camera)
+        reached, words = format_coverage(tables.adjusted, camera), camera_words(camera)
         yield Paragraph(
-            f"Image points of {camera_words(camera)} cover {100 * reached.whole:.0f} % of the format, those of an "
-            f"image {100 * np.median(reached.images):.0f} % (median; minimum {100 * reached.images.min():.0f} %): "
-            "beyond, the distortion is extrapolated."
+            f"Image points of {words} cover {100 * reached.whole:.0f} % of the format, those of an image "
+            f"{100 * np.median(reached.images):.0f} % (median; minimum {100 * reached.images.min():.0f} %): beyond, "
+            "the distortion is extrapolated."
             if len(reached.images)
-            else f"{camera_words(camera)} has no image points."
+            else f"{words} has no image points."
         )
     if (n := len(tables.adjusted.unknowns.interior)) > len(cameras):
         some = ", ".join(cameras)
         yield Paragraph(f"Plots show {len(cameras)} of {n} cameras, those with the most image points: {some}.")
     for camera, c in tables.correlations.items():
         if camera in cameras and c.parameters:
-            matrices = [("correlation of IOP", c.interior, c.parameters)]
-            matrices += [("mean |correlation| of EOP and IOP", c.mean_abs, c.eop_names)] if c.images else []
-            yield [
-                Plot(partial(plots.draw_matrix, values=v, rows=rows, columns=c.parameters, name=name), name, 3.8)
-                for name, v, rows in matrices
-            ]
-
-
-def _map_words(sensor: Sensor, one) -> str:
-    worst = one.worst[np.isfinite(one.worst)] / sensor.pixel_mm
-    spread = f"median {np.median(worst):.2g} px, worst {worst.max():.2g} px" if len(worst) else "unknown"
-    return f"{camera_words(one.camera)}: sigma {plots.distance_words(one.distance_m)}, {spread}"
+            pair = (plots.plot_interior_correlation, plots.plot_exterior_correlation)[: 1 + bool(c.images)]
+            yield [Plot(partial(plot, tables, camera), f"correlations of {camera_words(camera)}", 3.8) for plot in pair]
 
 
 def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
-    a = tables.adjusted
     yield Heading("Residuals")
     yield tables.residual_spread
     for camera in cameras:
-        words = camera_words(camera)
-        panels = [
-            Plot(partial(plots.plot_residuals, tables, camera), f"image residuals of {words}", 3.8),
-            Plot(partial(plots.plot_mean_residuals, tables, camera), f"mean residuals of {words}", 3.8),
-            Plot(partial(plots.plot_density, tables, camera), f"image points of {words} by cell"),
-        ]
+        panels = {
+            "image residuals": plots.plot_residuals, "mean residuals by cell": plots.plot_mean_residuals,
+            "image points by cell": plots.plot_density,
+        }  # fmt: skip
         if camera in tables.sigma_maps:
-            by_radius = partial(plots.plot_residuals_by_radius, tables, camera)
-            panels.append(Plot(by_radius, f"residuals of {words} by distance from the principal point"))
-        yield panels
-    if len(a.block.stations.who):
+            panels["residuals by distance from the principal point"] = plots.plot_residuals_by_radius
+        words = camera_words(camera)
+        yield [Plot(partial(plot, tables, camera), f"{name}, {words}", 3.8) for name, plot in panels.items()]
+    if len(tables.adjusted.block.stations.who):
         yield [Plot(partial(plots.plot_station_residuals, tables), "residuals of stations in order of time")]
     if len(tables.trends):
         yield Paragraph("Systematic residuals, by image format, time and strip:")
@@ -437,32 +411,23 @@ def points_section(tables: Tables, unit: str = "m") -> Iterator[Part]:
     table = table[table["n_images"] > 0]
     if table.empty:
         return
-    yield Heading("Object points")
+    edges = pd.IntervalIndex.from_breaks([*_RAYS, math.inf], closed="left")
+    names = [f"{low} to {high - 1}" if high > low + 1 else str(low) for low, high in itertools.pairwise(_RAYS)]
+    rays = pd.cut(table["n_images"], edges).cat.rename_categories([*names, f"{_RAYS[-1]} or more"])
     rows = []
-    classes = [(low, high) for low, high in zip(_RAYS, (*_RAYS[1:], math.inf), strict=True)]
-    for low, high in [*classes, (0, math.inf)]:
-        of = table[(table["n_images"] >= low) & (table["n_images"] < high)]
-        name = str(low) if high == low + 1 else f"{low} to {high - 1}" if high < math.inf else f"{low} or more"
-        sigmas = {f"median sigma {axis} [{unit}]": of_sigma(of[f"sigma_{axis}_m"].median()) for axis in AXES}
-        counts = {"points": len(of), "fraction": f"{100 * len(of) / len(table):.1f} %"}
-        angle = {"median angle [deg]": f"{of['angle_deg'].median():.1f}"}
-        row = {"rays": name if low else "all", **counts, **angle, **sigmas}
-        rows += [row] if len(of) else []
-    yield pd.DataFrame(rows)
+    for name, of in [*table.groupby(rays.rename("rays"), observed=True), ("all", table)]:
+        row = {"rays": name, "points": len(of), "fraction": f"{100 * len(of) / len(table):.1f} %"}
+        row["median angle [deg]"] = f"{of['angle_deg'].median():.1f}"
+        row |= {f"median sigma {axis} [{unit}]": of_sigma(of[f"sigma_{axis}_m"].median()) for axis in AXES}
+        rows.append(row)
     small = int((table["angle_deg"] < _SMALL_DEG).sum())
+    yield Heading("Object points")
+    yield pd.DataFrame(rows)
     yield Paragraph(
         f"{table['n_images'].mean():.2f} rays per point on average. The angle is the largest between two rays; {small} "
         f"points have less than {_SMALL_DEG:g} degrees."
     )
-    panels = [
-        Plot(partial(plots.plot_intersection_angles, tables), "histogram of intersection angles"),
-        Plot(partial(plots.plot_rays, tables), "number of points by number of rays"),
-    ]
-    in_z = table["sigma_Z_m"][table["sigma_Z_m"] > 0]
-    if len(in_z):
-        words = f"standard deviations of points; 95 % have less than {in_z.quantile(0.95):.3g} {unit} in Z"
-        panels.append(Plot(partial(plots.plot_point_sigmas, tables, unit=unit), words))
-    yield panels
+    yield [Plot(partial(plots.plot_intersection_angles, tables), "histogram of intersection angles")]
 
 
 def _check_points(tables: Tables) -> Iterator[Part]:
@@ -475,8 +440,6 @@ def _check_points(tables: Tables) -> Iterator[Part]:
     if len(tables.check_points):
         yield Heading("Check points: surveyed minus computed")
         yield check_spread(tables.check_points)
-        yield from map(Paragraph, accuracy_sentences(tables.tested_accuracy))
-        yield tables.positional_accuracy
         yield [
             Plot(partial(plots.plot_check_points, tables, upright=up),
                  f"discrepancies at check points in {'height' if up else 'plan'}", 3.8)
@@ -485,33 +448,18 @@ def _check_points(tables: Tables) -> Iterator[Part]:
         yield tables.check_points
 
 
-def _correlations(tables: Tables) -> Iterator[Part]:
-    if len(summary := tables.correlation_summary):
-        yield Heading("Correlation of exterior and interior orientation over the images")
-        yield Paragraph("The largest absolute correlation over the images; means are in correlation_summary.csv.")
-        yield side_by_side(summary, ["camera", "exterior"], "interior", "max_abs_rho")
-    ground = tables.correlation_ground
-    if len(ground := ground[ground["sigma_m"] > 0]):
-        yield Heading("Correlation of the interior orientation and the ground as a whole")
-        ground = ground.assign(ground=ground["ground"].str.replace("_", " "))
-        yield side_by_side(ground, ["camera", "ground", "sigma_m"], "parameter", "rho")
-
-
 def convergence_words(adjusted: Adjustment) -> str:
     """Describe the number of steps and the reason for termination."""
     history, n = adjusted.history, int(adjusted.steps)
     if history is None or not n:
         return ""
     refused = int((history.accepted == 0).sum())
-    bent = int(((history.bent > 0) & (history.accepted > 0)).sum())
-    words = counted(n, "step") + (f", {bent} of them along a curve (weakly determined unknowns)" if bent else "")
-    words += f", {refused} of them rejected and repeated with more damping" if refused else ""
+    words = counted(n, "step") + (f", {refused} of them rejected and repeated with more damping" if refused else "")
     last = history.length[-1] if len(history.length) == n else np.nan
     if adjusted.outcome is Outcome.CONVERGED:
         return f"{words}. Converged: the last moved no unknown by more than {last:.1e} of its standard deviation."
     if adjusted.outcome is Outcome.STEPS:
-        moved = f"; the last would still move unknowns by up to {last:.2g} sigma" if np.isfinite(last) else ""
-        return f"{words}, the maximum (--max-steps){moved}."
+        return f"{words}, the maximum (--max-steps); the last would still move unknowns by up to {last:.2g} sigma."
     return f"{words}. {adjusted.outcome.value.partition(': ')[2]}."
 
 
@@ -519,11 +467,6 @@ def report_title(block: Block) -> str:
     """Return the title of a block and the program it was converted from."""
     name = block.title or "jaxphoto adjustment"
     return f"{name}, converted from {block.converted_from}" if block.converted_from else name
-
-
-def assumed_pixels(sensors: Mapping[str, Sensor]) -> list[Part]:
-    """Return a paragraph on cameras with assumed pixel size, if there are any."""
-    return [Paragraph(words)] if (words := assumed_pixel_words(sensors)) else []
 
 
 def assumed_pixel_words(sensors: Mapping[str, Sensor]) -> str:
@@ -538,50 +481,6 @@ def assumed_pixel_words(sensors: Mapping[str, Sensor]) -> str:
     )
 
 
-# Positional accuracy ---------------------------------------------------------------------------------------------
-
-
-def accuracy_sentences(accuracy: PositionalAccuracy) -> list[str]:
-    """Return the tested accuracy class of each component, and why it cannot be claimed; empty without check points."""
-    if not accuracy.tested:
-        return []
-    sentences = [f"Positional accuracy by the {_STANDARD}; survey errors of the check points are included where known."]
-    sentences += class_sentences(accuracy)
-    if unknown := [t.name for t in accuracy.tested if math.isnan(t.survey_m) and t.n >= LEAST_CHECK_POINTS]:
-        sentences.append(
-            f"Survey standard deviations are missing for some check points ({', '.join(unknown)}): add them to "
-            "control_points.csv to claim the class."
-        )
-    for axis in accuracy.axes:
-        if axis.biased:
-            sentences.append(
-                f"The mean error in {axis.axis}, {_cm(axis.mean_m)}, exceeds a quarter of its RMSE "
-                f"({_cm(axis.rmse_m)}): look for a shift, such as of a datum or of a geoid, before signing."
-            )
-    if weak := [t.name for t in accuracy.tested[:2] if t.survey_m > t.rmse_m / 2]:
-        sentences.append(
-            f"The survey of the check points is not twice as accurate as the tested product ({', '.join(weak)}), as "
-            "the standard requires: survey them better."
-        )
-    return sentences
-
-
-def class_sentences(accuracy: PositionalAccuracy) -> list[str]:
-    """Return one sentence on the accuracy class of each component, horizontal first."""
-    return [_class_sentence(t) for t in accuracy.tested]
-
-
-def _class_sentence(t: ComponentAccuracy) -> str:
-    survey = "unknown" if math.isnan(t.survey_m) else _cm(t.survey_m)
-    measured = f"{t.symbol} = {_cm(t.rmse_m)} (block to check points {_cm(t.fit_m)}, survey {survey})"
-    accuracy_class = f"the {t.class_cm:g}-cm {t.symbol} {t.name} positional accuracy class"
-    points = counted(t.n, "check point")
-    if t.claimed:
-        return f"Tested with {points} to meet {accuracy_class}: {measured}."
-    few = f"tested with {points} only, where the standard asks for {LEAST_CHECK_POINTS}"
-    why = few if t.n < LEAST_CHECK_POINTS else f"tested with {points} whose survey errors are not all known"
-    return f"Cannot be claimed: {why}: {measured}, which would be {accuracy_class}."
-
-
-def _cm(metres: float) -> str:
-    return f"{100 * metres:.3g} cm"
+def assumed_pixels(sensors: Mapping[str, Sensor]) -> list[Part]:
+    """Return a paragraph on cameras with assumed pixel size, if there are any."""
+    return [Paragraph(words)] if (words := assumed_pixel_words(sensors)) else []

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import time
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -16,7 +15,7 @@ from jaxphoto.observations import AXES
 from jaxphoto.report.findings import in_symbols
 from jaxphoto.report.formatting import label_unit, readable
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot
-from jaxphoto.report.plots import axes_or_new, label, new_figure
+from jaxphoto.report.plots import axes_or_new, label
 from jaxphoto.report.results import assumed_pixels, rounded, write_study
 from jaxphoto.report.tables import Tables
 from jaxphoto.sensitivity.exact import Sensitivity, sensitivity
@@ -25,7 +24,6 @@ from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Columns of the largest changes in summary.json.
 _LARGEST = ("unit", "axis", "exact", "first_order", "over_sigma", "estimate_unit")
@@ -162,21 +160,6 @@ class SensitivityTables:
             f"check points, {a}, RMS [m]": [f"points[{p}].{a}" for p in self.check] for a in AXES if self.check
         }
 
-    def figure(self) -> Figure:
-        """Draw effects of the bias of each unit and axis on interior orientation and check points."""
-        interior = [name for name, (first, *_) in self.panels.items() if first.startswith("interior")]
-        panels = [name for name in self.panels if name not in interior[_SHOWN:]]
-        down = max(1, -(-len(panels) // 3))
-        figure = new_figure(9.6, 0.9 + 2.3 * down)
-        figure.set_layout_engine("constrained", h_pad=0.12)
-        for axes, name in zip(figure.subplots(down, 3, squeeze=False).flat, panels, strict=False):
-            _draw_effects(axes, self, name)
-        for axes in figure.axes[len(panels) :]:
-            axes.remove()
-        if panels:
-            figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
-        return figure
-
 
 def plot_sensitivity(tables: SensitivityTables, title: str, ax: Axes | None = None) -> Axes:
     """Draw effects of a station bias of each unit on an estimate or the check points: exact, first-order, difference.
@@ -185,24 +168,19 @@ def plot_sensitivity(tables: SensitivityTables, title: str, ax: Axes | None = No
     """
     if title not in tables.panels:
         raise InputError(f"unknown estimate {title!r}; use one of {'; '.join(tables.panels)}")
-    ax = axes_or_new(ax)
-    _draw_effects(ax, tables, title)
-    ax.legend(fontsize=8)
-    return ax
-
-
-def _draw_effects(axes: Axes, tables: SensitivityTables, title: str) -> None:
-    names = tables.panels[title]
+    ax, names = axes_or_new(ax), tables.panels[title]
     chosen = tables.bias[tables.bias["estimate"].isin(names)]
     by = chosen.groupby(["unit", "axis"], sort=False)[["exact", "first_order", "difference"]]
     values = by.sum() if len(names) == 1 else by.agg(_rms)
     at = np.arange(len(values))
     for k, (name, colour) in enumerate((("exact", "tab:blue"), ("first_order", "0.6"), ("difference", "tab:red"))):
-        axes.bar(at + 0.27 * (k - 1), values[name], 0.27, color=colour, label=name.replace("_", " "))
-    axes.set_xticks(at, [label(f"{unit} {axis}") for unit, axis in values.index], rotation=90, fontsize=7)
-    axes.axhline(0, color="0.4", lw=0.6)
-    axes.set_title(label(title), fontsize=10)
-    axes.tick_params(axis="y", labelsize=8)
+        ax.bar(at + 0.27 * (k - 1), values[name], 0.27, color=colour, label=name.replace("_", " "))
+    ax.set_xticks(at, [label(f"{unit} {axis}") for unit, axis in values.index], rotation=90, fontsize=7)
+    ax.axhline(0, color="0.4", lw=0.6)
+    ax.set_title(label(title), fontsize=10)
+    ax.tick_params(axis="y", labelsize=8)
+    ax.legend(fontsize=7)
+    return ax
 
 
 def _rms(values: pd.Series) -> float:
@@ -212,11 +190,8 @@ def _rms(values: pd.Series) -> float:
 def write_sensitivity(
     tables: SensitivityTables, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> None:
-    """Write three tables, sensitivity.png, report.html and summary.json into `directory`.
-
-    Raises InputError if `directory` contains anything but an earlier result.
-    """
-    began, adjusted, figure = time.perf_counter(), tables.adjusted, tables.figure()
+    """Write three tables, report.html and summary.json into `directory`."""
+    adjusted = tables.adjusted
     files = {
         "sensitivity": tables.bias, "variance_shares": tables.variance_shares,
         "external_reliability": tables.external_reliability,
@@ -237,7 +212,11 @@ def write_sensitivity(
         *assumed_pixels(adjusted.block.sensors),
         Heading("Largest effects"),
         tables.largest.rename(columns={"unit": tables.per}),
-        Plot(figure, "effects of a station bias: exact, first-order and their difference"),
+        [
+            Plot(partial(plot_sensitivity, tables, name), f"effects of a station bias on {name}: exact and first-order")
+            for k, name in enumerate(tables.panels)
+            if k < _SHOWN or name.startswith("check points")
+        ],
         Heading("Effects on the interior orientation"),
         changes.rename(columns={"unit": tables.per}),
         Paragraph("All estimates are in sensitivity.csv."),
@@ -247,20 +226,19 @@ def write_sensitivity(
         readable(reliability).rename(columns={"detectable": "MDB", "redundancy_number": "r"}),
     ]
     with whole_folder(directory) as work:
-        summary = _summary(tables, seconds | {"write": time.perf_counter() - began})
-        write_study(work, "Sensitivity", (verdict, ""), parts, summary, record, files, {"sensitivity": figure})
+        write_study(work, "Sensitivity", (verdict, ""), parts, _summary(tables, seconds), record, files)
 
 
 def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:
-    adjusted, largest, shares = tables.adjusted, tables.largest.set_index("estimate"), tables.variance_shares
+    adjusted, shares = tables.adjusted, tables.variance_shares.groupby("estimate")
     mdb = external_reliability(adjusted, tables.exact, tables.delta0).mdb
-    interior = {}
-    for name in (path for path in tables.exact.labels if path.startswith("interior")):
-        groups = shares[shares["estimate"] == name].set_index("group")["share"]
-        interior[name] = {
-            "largest_change": {key: largest.loc[name][key] for key in _LARGEST},
-            "variance_shares": {str(group): float(share) for group, share in groups.items()},
+    interior = {
+        row["estimate"]: {
+            "largest_change": {key: row[key] for key in _LARGEST},
+            "variance_shares": shares.get_group(row["estimate"]).set_index("group")["share"].to_dict(),
         }
+        for row in tables.largest.to_dict("records")
+    }
     return {
         "title": adjusted.block.title, "bias_m": tables.bias_m, "per": tables.per, "delta0": tables.delta0,
         "sigma0": float(adjusted.sigma0), "redundancy": adjusted.redundancy, "check_points": len(tables.check),

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -16,7 +17,7 @@ from jaxphoto.procedures.compare import Halves
 from jaxphoto.report.findings import as_sentence, p_words
 from jaxphoto.report.formatting import to_rich, without_empty
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot
-from jaxphoto.report.plots import axes_or_new, draw_format, draw_format_map, new_figure, title
+from jaxphoto.report.plots import axes_or_new, draw_format, draw_format_map, title
 from jaxphoto.report.results import assumed_pixel_words, assumed_pixels, write_study
 from jaxphoto.report.terminal import print_lines
 from jaxphoto.stability import ALIGNED, LEVEL, Analysis, Change, Method
@@ -25,7 +26,6 @@ from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
 
 # Ratio of the colour scale range to the largest offset: arrows remain visible on light colours.
 _LIGHT = 1.7
@@ -48,11 +48,11 @@ class Compared(NamedTuple):
 def about_sets(sets: tuple[Compared, Compared]) -> list[str]:
     """Describe both calibrations, the source of the uncertainty, and assumed pixel sizes."""
     without = [one.name for one in sets if not one.known]
-    uncertainty = "Uncertainty from the covariances of both sets, assuming different images."
-    if len(without) == 1:
-        uncertainty = f"{without[0]} has no covariance and is assumed exact: the uncertainty is that of the other set."
-    elif without:
-        uncertainty = "Neither set has a covariance: no uncertainty is given."
+    exact = f"{' '.join(without)} has no covariance and is assumed exact: the uncertainty is that of the other set."
+    uncertainty = {
+        0: "Uncertainty from the covariances of both sets, assuming different images.", 1: exact,
+        2: "Neither set has a covariance: no uncertainty is given.",
+    }[len(without)]  # fmt: skip
     assumed = assumed_pixel_words({one.name: one.sensor for one in sets})
     return [str(sets[0]), str(sets[1]), uncertainty, *([assumed] if assumed else [])]
 
@@ -87,24 +87,14 @@ def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_
 def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: float) -> pd.DataFrame:
     """Transpose the stability table to one column per method, in micrometres."""
     table = stability_table(analyses, pixel_mm, noise_mm).set_index("method")
-    um = {"RMSE_offset": "rmse_offset_mm", "as measured": "rmse_measured_mm", "largest": "largest_mm"}
-    with_sigma = "sigma_mm" in table
-    um |= (
-        {"sigma": "sigma_mm", "95 % from": "low_mm", "95 % to": "high_mm", "one camera": "expected_of_one_mm"}
-        if with_sigma
-        else {}
-    )
-    rows = {f"{name} [um]": (1e3 * table[column]).map("{:.4g}".format) for name, column in um.items()}
+    um = {
+        "RMSE_offset": "rmse_offset_mm", "as measured": "rmse_measured_mm", "largest": "largest_mm",
+        "sigma": "sigma_mm", "95 % from": "low_mm", "95 % to": "high_mm", "one camera": "expected_of_one_mm",
+    }  # fmt: skip
+    rows = {f"{name} [um]": (1e3 * table[c]).map("{:.4g}".format) for name, c in um.items() if c in table}
     rows["in pixels"] = table["rmse_offset_px"].map("{:.4g}".format)
-    rows |= {"p": table["p_value"].map("{:.2g}".format)} if with_sigma else {}
+    rows |= {"p": table["p_value"].map("{:.2g}".format)} if "p_value" in table else {}
     return pd.DataFrame(rows).T.reset_index(names="quantity")
-
-
-def offsets_table(analysis: Analysis) -> pd.DataFrame:
-    """Tabulate the offsets: grid x_mm, y_mm; dx_mm, dy_mm on the virtual image plane, and in the measured image."""
-    v = analysis.offsets
-    columns = ["x_mm", "y_mm", "dx_mm", "dy_mm", "dx_measured_mm", "dy_measured_mm"]
-    return pd.DataFrame(np.hstack([v.points, v.offsets, v.measured]), columns=columns)
 
 
 def plot_ray_offsets(analysis: Analysis, sensor: Sensor, ax: Axes | None = None) -> Axes:
@@ -141,29 +131,24 @@ def write_stability(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], sensor: Sensor, noise_mm: float,
     method: Method, directory: Path, record: CommandRecord,
 ) -> None:  # fmt: skip
-    """Write stability.csv, report.html and summary.json, and offsets.csv and offsets.png of `method`.
-
-    Raises InputError if `directory` contains anything but an earlier result.
-    """
-    chosen, figure = analyses[method], new_figure(7.2, 5.4)
-    plot_ray_offsets(chosen, sensor, figure.subplots())
+    """Write stability.csv, report.html and summary.json, and offsets.csv of `method`."""
+    chosen = analyses[method]
     methods = "The bundles of rays are " + "; ".join(f"{ALIGNED[name]} ({name})" for name in analyses) + "."
     parts: list[Part] = [
-        *map(Paragraph, about_sets(sets)),
-        Heading("By method"),
-        Paragraph(methods),
+        *map(Paragraph, about_sets(sets)), Heading("By method"), Paragraph(methods),
         by_method(analyses, sensor.pixel_mm, noise_mm),
-        Plot(figure, "offsets of the two bundles over the image"),
-    ]
+        Plot(partial(plot_ray_offsets, chosen, sensor), "offsets of the two bundles over the image", 4),
+    ]  # fmt: skip
     # Write µm only in the report: a terminal may be unable to display it.
     verdict = f"Bundles {ALIGNED[method]} ({method}): {chosen.verdict(noise_mm)}".replace(" um", " µm")
-    tables = {"stability": stability_table(analyses, sensor.pixel_mm, noise_mm), "offsets": offsets_table(chosen)}
+    v = chosen.offsets
+    columns = ["x_mm", "y_mm", "dx_mm", "dy_mm", "dx_measured_mm", "dy_measured_mm"]
+    offsets = pd.DataFrame(np.hstack([v.points, v.offsets, v.measured]), columns=columns)
+    tables = {"stability": stability_table(analyses, sensor.pixel_mm, noise_mm), "offsets": offsets}
     colour = "green" if chosen.similar(noise_mm) else "amber"
+    summary = stability_summary(analyses, sets, noise_mm, method)
     with whole_folder(directory) as work:
-        write_study(
-            work, "Stability of interior orientation", (verdict, colour), parts,
-            stability_summary(analyses, sets, noise_mm, method), record, tables, {"offsets": figure},
-        )  # fmt: skip
+        write_study(work, "Stability of interior orientation", (verdict, colour), parts, summary, record, tables)
 
 
 def stability_summary(
@@ -244,76 +229,52 @@ def change_headline(change: Change) -> str:
 
 def plot_change(change: Change, sensor: Sensor, ax: Axes | None = None, *, over_usual: bool = False) -> Axes:
     """Draw offsets of the rays of two calibrations over the format (px), or their ratio to the limit."""
-    ax = axes_or_new(ax)
-    name = f"offset over its {100 * LEVEL:.0f} % limit" if over_usual else "offset [px]"
+    ax, name = axes_or_new(ax), f"offset over its {100 * LEVEL:.0f} % limit" if over_usual else "offset [px]"
     values = change.offset_mm / (change.limit_mm if over_usual else sensor.pixel_mm)
     draw_format_map(ax, sensor, np.asarray(change.field.offsets.points), name, values)
     return ax
 
 
-def change_figure(change: Change, sensor: Sensor) -> Figure:
-    """Draw both maps of `plot_change` side by side."""
-    figure = new_figure(9.6, 3.9)
-    for axes, usual in zip(figure.subplots(1, 2), (False, True), strict=True):
-        plot_change(change, sensor, axes, over_usual=usual)
-    return figure
-
-
-def change_table(change: Change) -> pd.DataFrame:
-    """Tabulate the changed parameters as text; fixed parameters have no p-value."""
-    table = parameter_changes(change).drop(columns="ratio")
-    return table[(table["sigma"] > 0) | (table["first"] != 0) | (table["second"] != 0)]
-
-
 def print_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor, console: Console) -> None:
     """Print both calibrations, the parameters and the tests."""
     print_lines(about_sets(sets), console)
-    if change.parameters:
-        console.print(
-            to_rich(change_table(change).rename(columns={"first": "A", "second": "B", "difference": "B - A"}))
-        )
+    table = parameter_changes(change).drop(columns="ratio")
+    if len(table := table[(table["sigma"] > 0) | (table["first"] != 0) | (table["second"] != 0)]):
+        console.print(to_rich(table.rename(columns={"first": "A", "second": "B", "difference": "B - A"})))
     print_lines(change_verdict(change, sensor), console)
 
 
 def write_change(
     change: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path, record: CommandRecord
 ) -> None:
-    """Write parameters.csv, cells.csv, change.png, report.html and summary.json.
-
-    Raises InputError if `directory` contains anything but an earlier result.
-    """
-    parameters, figure = parameter_changes(change), change_figure(change, sensor)
+    """Write parameters.csv, cells.csv, report.html and summary.json."""
+    parameters, names = parameter_changes(change), {False: "offsets of rays [px]", True: "offsets over their limit"}
     parts: list[Part] = [
         *(Paragraph(as_sentence(sentence)) for sentence in change_verdict(change, sensor)),
         *map(Paragraph, about_sets(sets)),
         Heading("Over the format"),
-        Plot(figure, "maps over the image format: offsets of rays (px), and offsets over their limit"),
+        [Plot(partial(plot_change, change, sensor, over_usual=u), f"map of {name}") for u, name in names.items()],
         Heading("Parameters"),
         parameters,
     ]
     tables = {"parameters": parameters, "cells": change_cells(change, sensor)}
-    verdict = change_headline(change), "amber" if change.changed else "green"
+    verdict, summary = (change_headline(change), "amber" if change.changed else "green"), change_summary(change, sensor)
     with whole_folder(directory) as work:
-        write_study(
-            work, "Change of a camera", verdict, parts, change_summary(change, sensor), record, tables,
-            {"change": figure},
-        )  # fmt: skip
+        write_study(work, "Change of a camera", verdict, parts, summary, record, tables)
 
 
 def change_summary(change: Change, sensor: Sensor) -> dict[str, Any]:
     """Return the comparison for summary.json."""
-    field = change.field.uncertainty
+    field, tested = change.field.uncertainty, bool(change.degrees_of_freedom)
     return {
-        "verdict": change_verdict(change, sensor),
-        "method": change.field.method,
-        "chi_square": change.chi_square if change.degrees_of_freedom else None,
-        "degrees_of_freedom": change.degrees_of_freedom,
-        "p_parameters": change.p_parameters if change.degrees_of_freedom else None,
-        "p_field": None if field is None else field.p_value,
-        "n_beyond": int(change.beyond.sum()),
-        "n_points": len(change.limit_mm),
-    }
+        "verdict": change_verdict(change, sensor), "method": change.field.method,
+        "chi_square": change.chi_square if tested else None, "degrees_of_freedom": change.degrees_of_freedom,
+        "p_parameters": change.p_parameters if tested else None, "p_field": None if field is None else field.p_value,
+        "n_beyond": int(change.beyond.sum()), "n_points": len(change.limit_mm),
+    }  # fmt: skip
 
+
+# Halves ----------------------------------------------------------------------------------------------------------
 
 # Deviation of a factor from 1 in standard deviations above which it is significant.
 _SURE = 2.0
@@ -343,19 +304,15 @@ def cut_table(halves: Halves) -> pd.DataFrame:
     Columns: cut, factor, inside (fraction of cells within the band of the other splits), rms_px (of the difference over
     the format), sigma0_first, sigma0_second, problem, first (units of the first half).
     """
-    by, rows = halves.adjusted.block.owners(halves.by), []
+    by, rows, band = halves.adjusted.block.owners(halves.by), [], halves.band
     for k, cut in enumerate([*halves.cuts, *halves.failed]):
-        good = k < len(halves.cuts)
+        values, sigma0 = (np.nan,) * 3, cut.sigma0 or (np.nan, np.nan)
+        if k < len(halves.cuts):
+            values = band.of_cuts[k], band.inside[k], float(np.sqrt((cut.offsets_px**2).sum(axis=1).mean()))
         units = dict.fromkeys(unit for unit, first in zip(by, cut.first, strict=True) if first)
-        sigma0 = cut.sigma0 or (np.nan, np.nan)
-        rows.append({
-            "cut": k + 1,
-            "factor": halves.band.of_cuts[k] if good else np.nan,
-            "inside": halves.band.inside[k] if good else np.nan,
-            "rms_px": float(np.sqrt((cut.offsets_px**2).sum(axis=1).mean())) if good else np.nan,
-            "sigma0_first": sigma0[0], "sigma0_second": sigma0[1], "problem": cut.problem, "first": " ".join(units),
-        })  # fmt: skip
-    return pd.DataFrame(rows)
+        rows.append((k + 1, *values, *sigma0, cut.problem, " ".join(units)))
+    columns = ["cut", "factor", "inside", "rms_px", "sigma0_first", "sigma0_second", "problem", "first"]
+    return pd.DataFrame(rows, columns=columns)
 
 
 def halves_verdict(halves: Halves) -> list[str]:
@@ -399,46 +356,31 @@ def plot_halves(halves: Halves, ax: Axes | None = None, *, band: bool = False) -
     return ax
 
 
-def halves_figure(halves: Halves) -> Figure:
-    """Draw both maps of `plot_halves` side by side."""
-    figure = new_figure(9.6, 3.9)
-    for axes, band in zip(figure.subplots(1, 2), (False, True), strict=True):
-        plot_halves(halves, axes, band=band)
-    return figure
-
-
-def print_halves(halves: Halves, console: Console) -> None:
-    """Print the result."""
-    print_lines(halves_verdict(halves), console)
-
-
 def write_halves(
     halves: Halves, directory: Path, write_camera: Callable[[Path], object], record: CommandRecord
 ) -> None:
-    """Write cells.csv, cuts.csv, halves.png, report.html, summary.json, and the camera by `write_camera`.
-
-    Raises InputError if `directory` contains anything but an earlier result.
-    """
-    cells, cuts, verdict, figure = cell_table(halves), cut_table(halves), halves_verdict(halves), halves_figure(halves)
+    """Write cells.csv, cuts.csv, report.html, summary.json, and the camera by `write_camera`."""
+    cuts, verdict, block = cut_table(halves), halves_verdict(halves), halves.adjusted.block
     colour = "amber" if abs(halves.band.factor - 1) > _SURE * halves.band.sigma_factor else "green"
+    names = {False: "factor of the standard deviations", True: "radius that holds 95 % of the errors"}
     parts: list[Part] = [
         *(Paragraph(as_sentence(sentence)) for sentence in verdict[1:]),
-        *assumed_pixels(halves.adjusted.block.sensors),
+        *assumed_pixels(block.sensors),
         Heading("Over the format"),
-        Plot(figure, "maps over the format: factor of the standard deviations, radius that holds 95 % of the errors"),
+        [Plot(partial(plot_halves, halves, band=band), f"map of the {name}") for band, name in names.items()],
         Heading("Splits"),
         without_empty(cuts).rename(columns={"cut": "split", "first": "first half"}),
     ]
     inside, sigma = halves.inside
     summary = {
-        "title": halves.adjusted.block.title, "verdict": verdict, "camera": halves.camera, "by": halves.by,
+        "title": block.title, "verdict": verdict, "camera": halves.camera, "by": halves.by,
         "method": halves.method, "factor": halves.band.factor, "sigma_factor": halves.band.sigma_factor,
         "inside": inside if np.isfinite(inside) else None, "sigma_inside": sigma if np.isfinite(sigma) else None,
         "n_cuts": len(halves.cuts), "n_failed": len(halves.failed),
     }  # fmt: skip
     with whole_folder(directory) as work:
         write_camera(work)
+        tables = {"cells": cell_table(halves), "cuts": cuts}
         write_study(
-            work, f"{halves.adjusted.block.title or 'block'}: halves", (verdict[0], colour), parts, summary, record,
-            {"cells": cells, "cuts": cuts}, {"halves": figure},
+            work, f"{block.title or 'block'}: halves", (verdict[0], colour), parts, summary, record, tables
         )  # fmt: skip

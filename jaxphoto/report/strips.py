@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import time
 from collections.abc import Callable, Iterator, Sequence
+from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -17,13 +17,12 @@ from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.lidar.raster import Raster
 from jaxphoto.observations import AttitudeSteps, PositionSteps
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
-from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
 from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL, SurveyedGap
 from jaxphoto.report.draws import in_degrees
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
-from jaxphoto.report.formatting import label_unit, of_sigma, with_sigma
+from jaxphoto.report.formatting import label_unit, to_rich
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, verdict_parts
-from jaxphoto.report.plots import axes_or_new, draw_matrix, label, new_figure
+from jaxphoto.report.plots import axes_or_new, draw_matrix, label, title
 from jaxphoto.report.results import write_results, write_study
 from jaxphoto.report.tables import Tables
 from jaxphoto.report.terminal import print_lines
@@ -34,10 +33,7 @@ from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
-    from matplotlib.figure import Figure
-    from matplotlib.image import AxesImage
 
-_OF_POINTS = (PHOTOGRAPHS, CONTROL, CHECK)
 # Ratio of gaps at surveyed points to their noise above which they are a warning; additional tolerance for few planes
 # (sigmas).
 _FAR, _BEYOND = 2.0, 3.0
@@ -142,18 +138,14 @@ def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """Assess a strip adjustment; `tables` contains its adjustment if it has images."""
     found = _sigma_naught(result) if tables is None else verdict_of(tables).findings
     warnings = (Finding("message", "warning", sentence) for sentence in result.warnings)
-    return Verdict.of((*_lookups(result), *_steps(result), *warnings, *_surveyed(result), *found))
-
-
-def _lookups(result: StripAdjustment) -> Iterator[Finding]:
-    if not result.converged:
-        n, change = len(result.rounds), result.rounds[-1].largest_change
-        hint = "Increase the maximum number of iterations"
-        yield Finding("lookups_not_converged", "error", value=change, hint=hint, numbers={"n": n})
+    return Verdict.of((*_steps(result), *warnings, *_surveyed(result), *found))
 
 
 def _steps(result: StripAdjustment) -> Iterator[Finding]:
-    """Report trajectories whose corrections are far above their standard deviations."""
+    """Report missing convergence, and trajectories whose corrections are far above their standard deviations."""
+    if not result.converged:
+        n, change = len(result.rounds), result.rounds[-1].largest_change
+        yield Finding("lookups_not_converged", "error", value=change, numbers={"n": n})
     for steps, errors, unit in (
         (PositionSteps, result.errors.position, "m"),
         (AttitudeSteps, np.rad2deg(result.errors.attitude), "degrees"),
@@ -162,11 +154,8 @@ def _steps(result: StripAdjustment) -> Iterator[Finding]:
         if over_sigma > _CONTRADICTS:
             largest = [np.abs(errors[s.first : s.first + s.size]).max() for s in result.errors.splines]
             k = int(np.argmax(largest))
-            hint = "Check the heights, coordinate system and trajectory of this strip"
             numbers = {"unit": unit, "change": over_sigma}
-            yield Finding(
-                "strip_contradiction", "error", result.cloud.strips[k], float(largest[k]), hint=hint, numbers=numbers
-            )
+            yield Finding("strip_contradiction", "error", result.cloud.strips[k], float(largest[k]), numbers=numbers)
 
 
 def _surveyed(result: StripAdjustment) -> Iterator[Finding]:
@@ -187,19 +176,14 @@ def _surveyed(result: StripAdjustment) -> Iterator[Finding]:
 def surveyed_summary(result: StripAdjustment) -> dict[str, dict[str, float]]:
     """Summarise control and check points over all strips: planes, RMS of their gaps (m) before and after, noise."""
     summary: dict[str, dict[str, float]] = {}
-    for what in (CONTROL, CHECK):
-        rows = [d for d in result.differences if d.one == what]
-        if rows:
-            now, then = ([getattr(d, name) for d in rows] for name in ("planes", "planes_before"))
-            counts = {"rms_before_m": then, "rms_m": now, "noise_m": now}
-            pooled = {name: _pooled([getattr(d, name) for d in rows], n) for name, n in counts.items()}
-            summary[what.replace(" ", "_")] = {"planes": sum(now), **pooled}
+    for what, rows in differences_table(result.differences).groupby("one"):
+        if what in (CONTROL, CHECK):
+            pooled = {
+                name: float(np.sqrt(np.nansum(rows[name] ** 2 * rows[n]) / max(rows[n].sum(), 1)))
+                for name, n in (("rms_before_m", "planes_before"), ("rms_m", "planes"), ("noise_m", "planes"))
+            }
+            summary[str(what).replace(" ", "_")] = {"planes": int(rows["planes"].sum()), **pooled}
     return summary
-
-
-def _pooled(rms: Sequence[float], counts: Sequence[int]) -> float:
-    """Return the RMS of several sets; NaN (empty set) is skipped."""
-    return float(np.sqrt(np.nansum(np.square(rms) * counts) / max(sum(counts), 1)))
 
 
 def _sigma_naught(result: StripAdjustment) -> Iterator[Finding]:
@@ -225,45 +209,28 @@ def _sigma_naught(result: StripAdjustment) -> Iterator[Finding]:
 
 # Plots -----------------------------------------------------------------------------------------------------------
 
-_GAP = "later strip above earlier (cm)"
-# Number of points of a curve per knot; number of strips per row of panels.
-_PLACES, _ABREAST = 12, 4
+# Number of points of a curve per knot.
+_PLACES = 12
 _COMPONENTS = (("position (cm)", 100.0, ("X", "Y", "Z")), ("attitude (mdeg)", 1000.0, ("right", "forward", "up")))
 # Okabe and Ito (2008): distinguishable by colour-blind readers.
 _COLOURS = ("#0072B2", "#E69F00", "#009E73")
 
 
-def differences_figure(before: Raster, after: Raster) -> Figure:
-    """Draw gaps of strips before and after; one colour scale spans 95 % of the gaps before."""
-    figure = new_figure(10.0, 4.6)
-    both = figure.subplots(1, 2, sharex=True, sharey=True)
-    for axes, raster, name in zip(both, (before, after), ("before", "after"), strict=True):
-        shown = _draw_differences(axes, raster, _limit(before))
-        axes.set_title(f"{name}: {axes.get_title(loc='left')}", loc="left")
-    figure.colorbar(shown, ax=list(both), label=_GAP, shrink=0.8)
-    return figure
-
-
 def plot_strip_differences(gaps: Raster, ax: Axes | None = None, *, limit_m: float | None = None) -> Axes:
     """Draw gaps of strips in plan (`lidar.strip_differences`); colours up to `limit_m` (default: 95 % of the gaps)."""
-    ax = axes_or_new(ax)
-    shown = _draw_differences(ax, gaps, _limit(gaps) if limit_m is None else 100 * limit_m)
-    ax.figure.colorbar(shown, ax=ax, label=_GAP, shrink=0.8)
+    ax, limit = axes_or_new(ax), 100 * (_limit(gaps) if limit_m is None else limit_m)
+    (west, south), (east, north) = gaps.extent
+    shown = ax.imshow(100 * gaps.heights, extent=(west, east, south, north), cmap="RdBu_r", vmin=-limit, vmax=limit)
+    ax.figure.colorbar(shown, ax=ax, label="later strip above earlier [cm]", shrink=0.8)
+    title(ax, f"{100 * float(np.sqrt(np.nanmean(gaps.heights**2))):.2g} cm RMS")
+    ax.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
+    ax.ticklabel_format(useOffset=False, style="plain")
     return ax
 
 
 def _limit(gaps: Raster) -> float:
-    return 100 * float(np.nanpercentile(np.abs(gaps.heights), 95)) or 1.0
-
-
-def _draw_differences(axes: Axes, gaps: Raster, limit: float) -> AxesImage:
-    """Draw gaps and `limit` in centimetres."""
-    (west, south), (east, north) = gaps.extent
-    shown = axes.imshow(100 * gaps.heights, extent=(west, east, south, north), cmap="RdBu_r", vmin=-limit, vmax=limit)
-    axes.set_title(f"{100 * float(np.sqrt(np.nanmean(gaps.heights**2))):.2g} cm RMS", loc="left")
-    axes.set(xlabel="X (m)", ylabel="Y (m)", aspect="equal")
-    axes.ticklabel_format(useOffset=False, style="plain")
-    return shown
+    """Return the 95 % quantile of the gaps (m)."""
+    return float(np.nanpercentile(np.abs(gaps.heights), 95)) or 0.01
 
 
 def plot_scanner_correlation(result: StripAdjustment, ax: Axes | None = None, *, itself: bool = False) -> Axes:
@@ -271,32 +238,15 @@ def plot_scanner_correlation(result: StripAdjustment, ax: Axes | None = None, *,
 
     Raises InputError if none of these are estimated.
     """
-    rho, scanner, others = _scanner_and_others(result)
-    columns = scanner if itself else others
+    rho = all_correlations(result)
+    labels = [name for name in rho.index if not name.startswith(TrajectoryKnot.kind)]
+    scanner = [name for name in labels if name.startswith("scanner")]
+    columns = scanner if itself else [name for name in labels if name not in scanner]
     if not scanner or not columns:
         raise InputError(f"no parameters of {'the scanner' if not scanner else 'cameras and mounts'} are estimated")
     ax, name = axes_or_new(ax), f"scanner with {'itself' if itself else 'camera and mount'}"
     draw_matrix(ax, rho.loc[scanner, columns].to_numpy(), _short(scanner), _short(columns), name)
     return ax
-
-
-def scanner_correlation_figure(result: StripAdjustment) -> Figure:
-    """Draw correlations of the scanner with cameras and mounts, and with itself."""
-    _, scanner, others = _scanner_and_others(result)
-    sets = [(itself, names) for itself, names in ((False, others), (True, scanner)) if names]
-    figure = new_figure(3.4 + 0.52 * sum(len(names) for _, names in sets), 1.9 + 0.33 * len(scanner))
-    panels = figure.subplots(1, len(sets), squeeze=False, width_ratios=[len(names) for _, names in sets])[0]
-    for axes, (itself, _) in zip(panels, sets, strict=True):
-        plot_scanner_correlation(result, axes, itself=itself)
-    return figure
-
-
-def _scanner_and_others(result: StripAdjustment) -> tuple[pd.DataFrame, list[str], list[str]]:
-    """Return all correlations, the unknowns of the scanner, and the unknowns of cameras and mounts."""
-    rho = all_correlations(result)
-    labels = [name for name in rho.index if not name.startswith(TrajectoryKnot.kind)]
-    scanner = [name for name in labels if name.startswith("scanner")]
-    return rho, scanner, [name for name in labels if name not in scanner]
 
 
 def _short(labels: list[str]) -> list[str]:
@@ -329,22 +279,6 @@ def plot_trajectory_errors(
     return ax
 
 
-def trajectory_errors_figure(result: StripAdjustment) -> Figure:
-    """Draw position and attitude errors along each strip."""
-    names = result.cloud.strips
-    rows, columns = 2 * -(-len(names) // _ABREAST), min(len(names), _ABREAST)
-    figure = new_figure(1.2 + 2.6 * columns, 0.6 + 1.9 * rows)
-    panels = figure.subplots(rows, columns, squeeze=False)
-    for k, name in enumerate(names):
-        for part in (False, True):
-            panel = panels[2 * (k // _ABREAST) + part, k % _ABREAST]
-            plot_trajectory_errors(result, name, panel, attitude=part)
-            panel.tick_params(labelsize=7)
-    for panel in panels.flat:
-        panel.set_visible(panel.has_data())
-    return figure
-
-
 # Files and terminal ----------------------------------------------------------------------------------------------
 
 # Columns of the strip shifts without a trajectory.
@@ -365,13 +299,12 @@ def write_strips(
     write_corrected: Callable[[Path], tuple[Raster, Raster] | None],
     record: CommandRecord,
 ) -> None:
-    """Write tables, differences.png, report.html, summary.json; with images also the folder `adjustment`.
+    """Write tables, report.html, summary.json; with images also the folder `adjustment`.
 
     `tables` contains the adjustment if it has images. `write_corrected` writes cloud and trajectory into the folder and
-    returns the gaps of the strips before and after. Raises InputError if `directory` contains anything but an earlier
-    result.
+    returns the gaps of the strips before and after.
     """
-    began, seconds = time.perf_counter(), dict(result.adjusted.seconds)
+    seconds = dict(result.adjusted.seconds)
     files = {
         "strips": differences_table(result.differences), "rounds": strip_rounds_table(result.rounds),
         "scanner": calibration_table(result), "trajectory_errors": trajectory_errors_table(result),
@@ -382,24 +315,29 @@ def write_strips(
             write_results(tables, verdict, work / "adjustment", seconds, record=record)
         all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
         gaps = write_corrected(work)
-        figures = {} if gaps is None else {"differences": differences_figure(*gaps)}
         n = len(result.cloud.strips)
         name = f"{n} strip{'s' * (n > 1)}{' and photographs' if result.before else ''}: strip adjustment"
         summary = verdict.summary | {
             "rounds": len(result.rounds), "iteration_converged": result.converged,
             "sigma0": float(result.adjusted.sigma0),
             "pattern": result.errors.calibration.pattern, **surveyed_summary(result),
-            "seconds": seconds | {"write": time.perf_counter() - began},
+            "seconds": seconds,
         }  # fmt: skip
-        parts = [*verdict_parts(verdict), *_sections(result, files, figures.get("differences"))]
-        write_study(work, name, (verdict.headline, verdict.colour), parts, summary, record, files, figures)
+        parts = [*verdict_parts(verdict), *_sections(result, files, gaps)]
+        write_study(work, name, (verdict.headline, verdict.colour), parts, summary, record, files)
 
 
-def _sections(result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: Figure | None) -> Iterator[Part]:
+def _sections(
+    result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: tuple[Raster, Raster] | None
+) -> Iterator[Part]:
     yield Heading("Strips before and after")
     yield _in_tenths_of_mm(files["strips"])
     if gaps is not None:
-        yield Plot(gaps, "gaps of strips over the ground, before and after")
+        limit = _limit(gaps[0])
+        yield [
+            Plot(partial(plot_strip_differences, raster, limit_m=limit), f"gaps of strips over the ground, {when}", 4)
+            for raster, when in zip(gaps, ("before", "after"), strict=True)
+        ]
     if "surveyed_points" in files:
         yield Heading("Control and check points")
         yield Paragraph(
@@ -417,7 +355,14 @@ def _sections(result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: Fig
         yield Paragraph(
             "Parameters with correlations near 1 or -1 are not separable. correlation.csv has all unknowns."
         )
-        yield Plot(scanner_correlation_figure(result), "correlations of the scanner")
+        names = result.adjusted.structure.labels
+        yield [
+            Plot(
+                partial(plot_scanner_correlation, result, itself=itself), f"correlations of the scanner with {words}", 4
+            )
+            for itself, words in ((False, "camera and mount"), (True, "itself"))
+            if itself or not all(name.startswith(("scanner", TrajectoryKnot.kind)) for name in names)
+        ]
     if result.trajectory is None:
         yield Heading("Shifts of the strips")
         yield files["trajectory_errors"][_SHIFTS]
@@ -427,7 +372,15 @@ def _sections(result: StripAdjustment, files: dict[str, pd.DataFrame], gaps: Fig
             "Trajectory errors along each strip with bands of two standard deviations. Most of these is a common shift "
             "or rotation of all strips, which overlaps do not determine; between strips far less is undetermined."
         )
-        yield Plot(trajectory_errors_figure(result), "errors of the trajectory along each strip")
+        yield [
+            Plot(
+                partial(plot_trajectory_errors, result, name, attitude=attitude),
+                f"trajectory errors of strip {name}",
+                2.6,
+            )
+            for name in result.cloud.strips
+            for attitude in (False, True)
+        ]
     yield Heading("Iterations")
     yield files["rounds"]
 
@@ -444,18 +397,9 @@ def print_strips(result: StripAdjustment, console: Console) -> None:
     end = f"{'' if result.converged else 'not '}converged after {last.number} iterations"
     ties = f" and {last.points} tie points on them" if last.points else ""
     ties += f" and {last.control} of control" if last.control else ""
-    lines = [f"{end}; {last.planes} planes{ties}, {last.left_out} rejected"]
-    for d in result.differences:
-        before = f"{d.rms_before_m:.3f} m" if np.isfinite(d.rms_before_m) else "unknown"
-        pair = f"{d.one} and strip {d.other}" if d.one in _OF_POINTS else f"strips {d.one} and {d.other}"
-        lines.append(
-            f"  {pair}: gap {before} before, {d.rms_m:.3f} m after (RMS of {d.planes} planes, noise {d.noise_m:.3f} m)"
-        )
+    print_lines([f"{end}; {last.planes} planes{ties}, {last.left_out} rejected"], console)
+    console.print(to_rich(_in_tenths_of_mm(differences_table(result.differences)), "gaps of strips"))
     if result.trajectory is None:
-        for one in trajectory_errors_table(result).to_dict("records"):
-            estimated = [(a, one[f"{a}_m"], one[f"sigma_{a}_m"]) for a in "XYZ" if one[f"sigma_{a}_m"] > 0]
-            shift = ", ".join(f"{a} {with_sigma(v, s)} m (sigma {of_sigma(s)})" for a, v, s in estimated)
-            lines.append(f"  strip {one['strip']}: {'shift ' + shift if shift else 'fixed'}")
-    for parameter, value, sigma in calibration_table(result)[["parameter", "value", "sigma"]].itertuples(index=False):
-        lines.append(f"  {parameter}: {with_sigma(value, sigma)} (sigma {of_sigma(sigma)})")
-    print_lines(lines, console)
+        console.print(to_rich(trajectory_errors_table(result)[_SHIFTS], "shifts of strips"))
+    if len(table := calibration_table(result)):
+        console.print(to_rich(table, "scanner and cameras"))

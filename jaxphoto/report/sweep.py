@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pandas as pd
@@ -19,18 +19,10 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLUMNS = ("design", "converged", "determined", "quantity", "of", "value", "unit")
+_WITH_UNIT = ("sigma", "rms_sigma", "check_sigma", "check_rmse")
 _DEG = 180 / np.pi
 # Ratio of largest to smallest value above which an axis is logarithmic.
 _FAR_APART = 20.0
-
-
-class _Column(NamedTuple):
-    """Values of one quantity for all designs."""
-
-    quantity: str
-    of: str
-    values: np.ndarray
-    unit: str
 
 
 def sweep_table(sweep: Sweep) -> pd.DataFrame:
@@ -53,91 +45,65 @@ def sweep_table(sweep: Sweep) -> pd.DataFrame:
     column.
     """
     names = list(sweep.parameters[0])
-    taken = [name for name in names if name in _COLUMNS]
-    if taken:
+    if taken := [name for name in names if name in _COLUMNS]:
         raise InputError(f"design parameter {taken[0]} has the name of a table column; rename it")
-    columns = list(_columns(sweep))
-    design = np.repeat(np.arange(len(sweep)), len(columns))
-    n = len(sweep)
-    table = pd.DataFrame([dict(p) for p in sweep.parameters], columns=names).iloc[design].reset_index(drop=True)
-    table["design"] = design + 1
-    table["converged"], table["determined"] = sweep.converged[design], sweep.determined[design]
-    table["quantity"], table["of"] = [c.quantity for c in columns] * n, [c.of for c in columns] * n
-    table["value"] = np.stack([c.values for c in columns], axis=1).ravel()
-    table["unit"] = [c.unit for c in columns] * n
+    columns = pd.DataFrame({"|".join(key): values for key, values in _columns(sweep)})
+    designs = pd.DataFrame([dict(p) for p in sweep.parameters], columns=names)
+    designs = designs.assign(design=np.arange(len(sweep)) + 1, converged=sweep.converged, determined=sweep.determined)
+    keys = designs.columns.tolist()
+    wide = designs.join(columns)
+    table = wide.melt(keys, var_name="key", value_name="value").sort_values("design", kind="stable")
+    table[["quantity", "of"]] = table.pop("key").str.split("|", expand=True)
+    table["unit"] = table["of"].map(lambda of: without_unit(of)[1]).where(table["quantity"].isin(_WITH_UNIT), "")
     # NaN in a determined design: the design lacks the quantity.
     usable = table["value"].notna() | ~(table["converged"] & table["determined"])
-    return table[usable].reset_index(drop=True)
+    return table.loc[usable, [*keys, "quantity", "of", "value", "unit"]].reset_index(drop=True)
 
 
-def _columns(sweep: Sweep) -> Iterator[_Column]:
-    shared, factors = _shared_names(sweep.labels)
-    exterior = [f"{name}_m" if k < 3 else f"{name}_deg" for k, name in enumerate(sweep.eop_names)]
-    for k, (name, factor) in enumerate(zip(shared, factors, strict=True)):
-        yield _Column("sigma", name, factor * sweep.sigma[:, k], _unit(name))
-    for k, name in enumerate(exterior):
-        yield _Column("rms_sigma", name, (1.0 if k < 3 else _DEG) * sweep.exterior_sigma[:, k], _unit(name))
+def _columns(sweep: Sweep) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
+    """Yield (quantity, of) and the values of all designs."""
+    last = [label.rpartition("].")[2] for label in sweep.labels]
+    labels = last if len(set(last)) == len(last) else list(sweep.labels)
+    shared = [label.removesuffix("_rad") + "_deg" if label.endswith("_rad") else label for label in labels]
+    for k, name in enumerate(shared):
+        yield ("sigma", name), (_DEG if labels[k].endswith("_rad") else 1.0) * sweep.sigma[:, k]
+    for k, name in enumerate(sweep.eop_names):
+        unit, factor = ("m", 1.0) if k < 3 else ("deg", _DEG)
+        yield ("rms_sigma", f"{name}_{unit}"), factor * sweep.exterior_sigma[:, k]
     for a, b in zip(*np.triu_indices(len(shared), 1), strict=True):
-        yield _Column("rho", f"{shared[a]}:{shared[b]}", sweep.correlation[:, a, b], "")
+        yield ("rho", f"{shared[a]}:{shared[b]}"), sweep.correlation[:, a, b]
     for quantity, values in (("mean_abs_rho", sweep.mean_abs), ("max_abs_rho", sweep.max_abs)):
         for e, k in np.ndindex(values.shape[1:]):
-            yield _Column(quantity, f"{sweep.eop_names[e]}:{shared[k]}", values[:, e, k], "")
+            yield (quantity, f"{sweep.eop_names[e]}:{shared[k]}"), values[:, e, k]
     for quantity, values in (("check_sigma", sweep.check_sigma), ("check_rmse", sweep.check_rmse)):
         for k, axis in enumerate(AXES):
-            yield _Column(quantity, f"{axis}_m", values[:, k], "m")
-    yield _Column("sigma0", "block", sweep.sigma0, "")
-
-
-def _shared_names(labels: Sequence[str]) -> tuple[list[str], list[float]]:
-    """Return the names of the shared unknowns, with angles in degrees, and the factors of this conversion."""
-    last = [label.rpartition("].")[2] for label in labels]
-    chosen = last if len(set(last)) == len(last) else labels
-    factors = [_DEG if label.endswith("_rad") else 1.0 for label in labels]
-    return [name.removesuffix("_rad") + "_deg" if name.endswith("_rad") else name for name in chosen], factors
-
-
-def _unit(name: str) -> str:
-    """Return the unit at the end of a name; "" for a distortion coefficient (docs/models.md)."""
-    return without_unit(name)[1]
+            yield (quantity, f"{axis}_m"), values[:, k]
+    yield ("sigma0", "block"), sweep.sigma0
 
 
 def sweep_figure(table: pd.DataFrame, x: str, shown: Sequence[tuple[str, str]], by: Sequence[str] = ()) -> Figure:
-    """Draw one panel per (quantity, of) of `shown`: values against the parameter `x`, one line per value of `by`.
-
-    `table` is the table of `sweep_table`, or a subset in which `x` and `by` identify each design. Raises InputError if
-    they do not, or for missing columns or quantities.
-    """
-    figure = new_figure(3.4 * min(len(shown), 3), 2.9 * -(-len(shown) // 3))
-    panels = figure.subplots(-(-len(shown) // 3), min(len(shown), 3), squeeze=False).ravel()
-    for axes, (quantity, of) in zip(panels, shown, strict=False):
-        _lines(axes, _chosen(table, x, quantity, of, by), x, by)
-    for axes in panels[len(shown) :]:
-        axes.set_axis_off()
+    """Draw one `plot_sweep` per (quantity, of) of `shown`."""
+    down, across = -(-len(shown) // 3), min(len(shown), 3)
+    figure = new_figure(3.4 * across, 2.9 * down)
+    for k, (quantity, of) in enumerate(shown):
+        panel = plot_sweep(table, x, quantity, of, figure.add_subplot(down, across, k + 1), by=by)
+        if by and (legend := panel.get_legend()):
+            legend.remove()
     if by:
-        figure.legend(*panels[0].get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
+        figure.legend(*panel.get_legend_handles_labels(), loc="outside lower center", ncols=3, fontsize=8)
     return figure
 
 
 def plot_sweep(
     table: pd.DataFrame, x: str, quantity: str, of: str, ax: Axes | None = None, *, by: Sequence[str] = ()
 ) -> Axes:
-    """Draw one panel of `sweep_figure`: a quantity against the parameter `x`, one line per value of `by`.
+    """Draw a quantity against the parameter `x`, one line per value of `by`.
 
-    Raises the errors of `sweep_figure`.
+    `table` is the table of `sweep_table`, or a subset in which `x` and `by` identify each design. Raises InputError if
+    they do not, or for missing columns or quantities.
     """
-    rows = _chosen(table, x, quantity, of, by)
-    ax = axes_or_new(ax)
-    _lines(ax, rows, x, by)
-    if by:
-        ax.legend(fontsize=8)
-    return ax
-
-
-def _chosen(table: pd.DataFrame, x: str, quantity: str, of: str, by: Sequence[str]) -> pd.DataFrame:
-    """Select the rows to draw."""
-    for column in (x, *by):
-        if column not in table:
-            raise InputError(f"the table has no column {column}: choose among {', '.join(map(str, table.columns))}")
+    if missing := [column for column in (x, *by) if column not in table]:
+        raise InputError(f"the table has no column {missing[0]}: choose among {', '.join(map(str, table.columns))}")
     rows = table[(table["quantity"] == quantity) & (table["of"] == of)]
     if rows.empty:
         raise InputError(f"the table has no {quantity} of {of}: look at table[['quantity', 'of']].drop_duplicates()")
@@ -146,28 +112,24 @@ def _chosen(table: pd.DataFrame, x: str, quantity: str, of: str, by: Sequence[st
             f"several designs have the same {', '.join([x, *by])}: select rows in which these identify "
             "each design, or add parameters to by"
         )
-    return rows
-
-
-def _lines(axes: Axes, rows: pd.DataFrame, x: str, by: Sequence[str]) -> None:
-    places = rows[x].drop_duplicates()
+    ax, places = axes_or_new(ax), rows[x].drop_duplicates()
     numbers = pd.api.types.is_numeric_dtype(places) and not pd.api.types.is_bool_dtype(places)
     for name, line in rows.groupby(list(by), sort=False) if by else [((), rows)]:
-        name_of_line = label(", ".join(f"{p} {v}" for p, v in zip(by, name, strict=True)))
+        words = label(", ".join(f"{p} {v}" for p, v in zip(by, name, strict=True)))
         at = line.sort_values(x) if numbers else line
-        axes.plot(at[x] if numbers else at[x].astype(str).map(label), at["value"], "o-", ms=3, lw=1, label=name_of_line)
-    if numbers and _far_apart(places):
-        log_ticks(axes)
-    if rows["quantity"].iloc[0].endswith("abs_rho"):
-        axes.set_ylim(0, 1.02)
-    elif _far_apart(rows["value"]):
-        axes.set_yscale("log")
-    quantity, of, unit = rows[["quantity", "of", "unit"]].iloc[0]
-    axes.set_title(label(f"{quantity} {of}" + f" [{unit}]" * bool(unit)), fontsize=9)
-    axes.set_xlabel(label(x), fontsize=8)
-    axes.tick_params(labelsize=7)
-    axes.grid(lw=0.3)
-
-
-def _far_apart(values: pd.Series) -> bool:
-    return bool(values.min() > 0 and values.max() / values.min() >= _FAR_APART)
+        ax.plot(at[x] if numbers else at[x].astype(str).map(label), at["value"], "o-", ms=3, lw=1, label=words)
+    far_apart = lambda v: v.min() > 0 and v.max() / v.min() >= _FAR_APART  # noqa: E731
+    if numbers and far_apart(places):
+        log_ticks(ax)
+    if quantity.endswith("abs_rho"):
+        ax.set_ylim(0, 1.02)
+    elif far_apart(rows["value"]):
+        ax.set_yscale("log")
+    unit = rows["unit"].iloc[0]
+    ax.set_title(label(f"{quantity} {of}" + f" [{unit}]" * bool(unit)), fontsize=9)
+    ax.set_xlabel(label(x), fontsize=8)
+    ax.tick_params(labelsize=7)
+    ax.grid(lw=0.3)
+    if by:
+        ax.legend(fontsize=8)
+    return ax

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
+from operator import attrgetter
 from typing import Any
 
 import equinox as eqx
@@ -10,6 +11,7 @@ import numpy as np
 import pandas as pd
 from jaxtyping import Float
 
+from jaxphoto import statistics
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import Residuals
 from jaxphoto.arrays import ArrayLike
@@ -20,39 +22,6 @@ from jaxphoto.parameters import unit_of
 from jaxphoto.report.findings import symbol
 from jaxphoto.report.formatting import in_file_unit, label_unit
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
-from jaxphoto.statistics import (
-    BlunderTest,
-    CameraDrift,
-    Correlations,
-    Covariance,
-    EffectTest,
-    GroundCorrelations,
-    MdbEffects,
-    PositionalAccuracy,
-    Redundancy,
-    Rotations,
-    Significance,
-    Suspect,
-    a_priori_sigmas,
-    blunder_test,
-    camera_drifts,
-    check_discrepancies,
-    correlations,
-    covariance,
-    ground_correlations,
-    mdb_effects,
-    minimal_detectable_biases,
-    multiple_outlier_test,
-    normalised_residuals,
-    observation_groups,
-    physical_residuals,
-    positional_accuracy,
-    prepare_statistics,
-    redundancy_numbers,
-    residual_spread,
-    significance,
-    systematic_effect_tests,
-)
 from jaxphoto.statistics.block_geometry import intersection_angles
 from jaxphoto.statistics.correlation import FORMS
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
@@ -72,13 +41,13 @@ class Tables:
     def __init__(
         self,
         adjusted: Adjustment,
-        rotations: Rotations = "omega_phi_kappa",
+        rotations: statistics.Rotations = "omega_phi_kappa",
         truth: Mapping[str, pd.DataFrame] | None = None,
-        known: Covariance | None = None,
+        known: statistics.Covariance | None = None,
     ):
         refuse_traced("Tables", adjusted)
         self.adjusted = adjusted
-        self.rotations: Rotations = rotations
+        self.rotations: statistics.Rotations = rotations
         self.truth = truth
         if known is not None and known.rotations != "omega_phi_kappa":
             raise ValueError(f"known: rotations {known.rotations!r}; use the covariance with omega, phi, kappa")
@@ -96,71 +65,67 @@ class Tables:
     # Statistics as arrays ----------------------------------------------------------------------------------------
 
     @cached_property
-    def covariance(self) -> Covariance:
+    def covariance(self) -> statistics.Covariance:
         """Covariance with omega, phi, kappa."""
-        prepare_statistics(self.adjusted.equations, self.adjusted.seconds)
-        return covariance(self.adjusted, rows=True) if self._known is None else self._known
+        statistics.prepare_statistics(self.adjusted.equations, self.adjusted.seconds)
+        return statistics.covariance(self.adjusted, rows=True) if self._known is None else self._known
 
     def _if_converged(self, sigma: ArrayLike) -> np.ndarray:
         """Return the standard deviations; NaN for an adjustment that did not converge."""
         return np.where(bool(self.adjusted.converged), np.asarray(sigma), np.nan)
 
     @cached_property
-    def redundancy(self) -> Redundancy:
+    def redundancy(self) -> statistics.Redundancy:
         """Redundancy number of every observation."""
-        return redundancy_numbers(self.adjusted, self.covariance)
+        return statistics.redundancy_numbers(self.adjusted, self.covariance)
 
     @cached_property
     def w(self) -> Residuals:
         """Normalised residual of every observation."""
-        return normalised_residuals(self.adjusted, self.redundancy)
+        return statistics.normalised_residuals(self.adjusted, self.redundancy)
 
     @cached_property
-    def blunders(self) -> BlunderTest:
+    def blunders(self) -> statistics.BlunderTest:
         """Test of every normalised residual against the critical value for all of them."""
-        return blunder_test(self.adjusted, self.redundancy)
+        return statistics.blunder_test(self.adjusted, self.redundancy)
 
     @cached_property
-    def culprits(self) -> tuple[Suspect, ...]:
+    def culprits(self) -> tuple[statistics.Suspect, ...]:
         """Suspects that are not explained by larger blunders."""
-        return multiple_outlier_test(self.adjusted, self.blunders)
+        return statistics.multiple_outlier_test(self.adjusted, self.blunders)
 
     @cached_property
-    def tested_trends(self) -> list[EffectTest]:
+    def tested_trends(self) -> list[statistics.EffectTest]:
         """Tested systematic effects in the residuals, suspects excluded."""
         suspects = [(s.group, s.row) for s in self.blunders.suspects]
-        return systematic_effect_tests(self.adjusted, np.asarray(self.covariance.shared_sigma), suspects)
+        return statistics.systematic_effect_tests(self.adjusted, np.asarray(self.covariance.shared_sigma), suspects)
 
     @cached_property
-    def undetected(self) -> MdbEffects:
+    def undetected(self) -> statistics.MdbEffects:
         """External reliability: effects of biases of one MDB."""
-        return mdb_effects(self.adjusted, self.covariance, self.redundancy)
+        return statistics.mdb_effects(self.adjusted, self.covariance, self.redundancy)
 
     @cached_property
-    def correlations(self) -> dict[str, Correlations]:
+    def correlations(self) -> dict[str, statistics.Correlations]:
         """Correlations by camera."""
-        chosen = self.covariance if self.rotations == "omega_phi_kappa" else covariance(self.adjusted, self.rotations)
-        return correlations(self.adjusted, chosen)
+        if self.rotations == "omega_phi_kappa":
+            return statistics.correlations(self.adjusted, self.covariance)
+        return statistics.correlations(self.adjusted, statistics.covariance(self.adjusted, self.rotations))
 
     @cached_property
-    def significance(self) -> list[Significance]:
+    def significance(self) -> list[statistics.Significance]:
         """Ratio and t-test of every estimated interior parameter; empty if the adjustment did not converge."""
-        return significance(self.adjusted, self.covariance) if bool(self.adjusted.converged) else []
+        return statistics.significance(self.adjusted, self.covariance) if bool(self.adjusted.converged) else []
 
     @cached_property
-    def tested_drifts(self) -> list[CameraDrift]:
+    def tested_drifts(self) -> list[statistics.CameraDrift]:
         """Drift test of every camera with estimated rates."""
-        return camera_drifts(self.adjusted, self.covariance)
+        return statistics.camera_drifts(self.adjusted, self.covariance)
 
     @cached_property
-    def tested_accuracy(self) -> PositionalAccuracy:
-        """Positional accuracy at the check points."""
-        return positional_accuracy(check_discrepancies(self.adjusted))
-
-    @cached_property
-    def ground_correlations(self) -> dict[str, GroundCorrelations]:
+    def ground_correlations(self) -> dict[str, statistics.GroundCorrelations]:
         """Correlations of each camera with height and doming of the ground."""
-        return ground_correlations(self.adjusted, self.covariance)
+        return statistics.ground_correlations(self.adjusted, self.covariance)
 
     @cached_property
     def sigma_maps(self) -> dict[str, tuple[SigmaMap, SigmaMap]]:
@@ -273,11 +238,11 @@ class Tables:
         otherwise millions of observations would need ten times the memory.
         """
         adjusted, block, s = self.adjusted, self.adjusted.block, self.adjusted.structure
-        residual, sigma = physical_residuals(adjusted), a_priori_sigmas(adjusted)
-        detectable = minimal_detectable_biases(adjusted, self.redundancy)
+        residual, sigma = statistics.physical_residuals(adjusted), statistics.a_priori_sigmas(adjusted)
+        detectable = statistics.minimal_detectable_biases(adjusted, self.redundancy)
         labels = np.full(len(adjusted.values.shared), "", object)
         labels[s.free] = s.labels
-        groups = {name: rows for name, rows in observation_groups(adjusted).items() if np.size(residual[name])}
+        groups = {g: rows for g, rows in statistics.observation_groups(adjusted).items() if np.size(residual[g])}
 
         def column(of: Callable[[str, AbstractObservations], Any]) -> np.ndarray:
             # Rows are along the last axis; in the table the components of a row are consecutive.
@@ -329,7 +294,7 @@ class Tables:
     def residual_spread(self) -> pd.DataFrame:
         """Spread of the residuals: group, axis, n, mean, rmse, max_abs, unit (paper 000, Table 3)."""
         columns = ["group", "axis", "n", "mean", "rmse", "max_abs", "unit"]
-        return pd.DataFrame([[getattr(s, c) for c in columns] for s in residual_spread(self.adjusted)], columns=columns)
+        return pd.DataFrame(map(attrgetter(*columns), statistics.residual_spread(self.adjusted)), columns=columns)
 
     @cached_property
     def check_points(self) -> pd.DataFrame:
@@ -337,21 +302,13 @@ class Tables:
 
         The standard deviations combine survey and adjustment. Values are NaN for axes that were not surveyed.
         """
-        rows = check_discrepancies(self.adjusted)
-        points = list(dict.fromkeys(rows.who.tolist()))
-        place = {p: k for k, p in enumerate(points)}
-        at = [place[p] for p in rows.who.tolist()], rows.axis
-        difference, sigma = np.full((len(points), 3), np.nan), np.full((len(points), 3), np.nan)
-        difference[at] = rows.value
-        sigma[at] = np.hypot(np.asarray(rows.sigma), np.asarray(self.covariance.point_sigma)[rows.who, rows.axis])
-        columns: dict[str, Any] = {"point": [self.adjusted.block.points[p] for p in points]}
-        columns |= {f"d{axis}_m": difference[:, k] for k, axis in enumerate(AXES)}
-        return pd.DataFrame(columns | {f"sigma_d{axis}_m": sigma[:, k] for k, axis in enumerate(AXES)})
-
-    @cached_property
-    def positional_accuracy(self) -> pd.DataFrame:
-        """Accuracy (ASPRS Edition 2): component, check_points, fit_m, survey_m, rmse_m, class_cm, claimed."""
-        return accuracy_table(self.tested_accuracy)
+        rows, names = statistics.check_discrepancies(self.adjusted), [f"d{axis}_m" for axis in AXES]
+        who, at = pd.factorize(np.asarray(rows.who)), np.asarray(self.covariance.point_sigma)[rows.who, rows.axis]
+        values = np.full((2, len(who[1]), 3), np.nan)
+        values[:, who[0], rows.axis] = rows.value, np.hypot(np.asarray(rows.sigma), at)
+        table = pd.DataFrame(np.hstack(list(values)), columns=[*names, *(f"sigma_{name}" for name in names)])
+        table.insert(0, "point", [self.adjusted.block.points[p] for p in who[1]])
+        return table
 
     @cached_property
     def correlation(self) -> pd.DataFrame:
@@ -455,33 +412,18 @@ def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
     end = n == int(adjusted.steps)
     sums = np.append(history.sum_of_squares, float(adjusted.sum_of_squares)) if end else history.sum_of_squares
     columns = {
-        "step": pd.Series([*map(str, range(1, n + 1)), *(["end"] if end else [])]),
-        "sigma0": pd.Series(np.sqrt(sums / redundancy)),
-        "length": pd.Series(history.length),
-        "damping": pd.Series(history.damping),
-        "bent": pd.Series(np.where(history.bent > 0, history.bent, np.nan)),
-        "taken": pd.Series(np.where(history.accepted > 0, "yes", "no")),
-    }
-    return pd.DataFrame(columns).fillna({"taken": ""})
+        "step": [*map(str, range(1, n + 1)), *(["end"] if end else [])], "sigma0": np.sqrt(sums / redundancy),
+        "length": history.length, "damping": history.damping,
+        "bent": np.where(history.bent > 0, history.bent, np.nan), "taken": np.where(history.accepted > 0, "yes", "no"),
+    }  # fmt: skip
+    return pd.DataFrame({name: pd.Series(values) for name, values in columns.items()}).fillna({"taken": ""})
 
 
 def check_spread(check: pd.DataFrame) -> pd.DataFrame:
     """Tabulate the discrepancies at check points: axis, n, mean, rmse, max_abs, unit."""
     values = check[[f"d{axis}_m" for axis in AXES]].set_axis(AXES, axis=1)
-    columns = {
-        "n": values.count(),
-        "mean": values.mean(),
-        "rmse": np.sqrt((values**2).mean()),
-        "max_abs": values.abs().max(),
-    }
-    return pd.DataFrame(columns).reset_index(names="axis").assign(unit="m")
-
-
-def accuracy_table(accuracy: PositionalAccuracy) -> pd.DataFrame:
-    """Tabulate the accuracy: component, check_points, fit_m, survey_m, rmse_m (including survey), class_cm, claimed."""
-    columns = ["component", "check_points", "fit_m", "survey_m", "rmse_m", "class_cm", "claimed"]
-    rows = [(t.symbol, t.n, t.fit_m, t.survey_m, t.rmse_m, t.class_cm, t.claimed) for t in accuracy.tested]
-    return pd.DataFrame(rows, columns=columns)
+    spread = {"mean": values.mean(), "rmse": np.sqrt((values**2).mean()), "max_abs": values.abs().max()}
+    return pd.DataFrame({"n": values.count(), **spread}).reset_index(names="axis").assign(unit="m")
 
 
 def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) -> pd.DataFrame:
@@ -509,31 +451,39 @@ def with_correlated_sigma(interior: pd.DataFrame, adjusted: Adjustment, factor: 
     return interior.assign(sigma_correlated=np.where(np.isfinite(sigma), np.maximum(scaled, sigma), np.nan))
 
 
-# In a recovered simulation (estimate - truth) / sigma is standard normal if the model is correct, except for the datum.
-
-# Tables with one column per quantity: column of the names, and prefix of the labels.
-_WIDE = {"exterior": ("image", "exterior"), "object_points": ("point", "points")}
-_COLUMNS = ("parameter", "estimate", "truth", "sigma")
-
-
 def recovery_table(tables: Tables, truth: Mapping[str, pd.DataFrame]) -> pd.DataFrame:
     """Tabulate estimates and true values: parameter, estimate, truth, error, sigma, ratio (error / sigma), unit.
 
     `truth` contains the tables of `jaxphoto.io.truth_tables(simulation)`, with columns as in the result tables.
-    Quantities missing on one side are skipped.
+    Quantities missing on one side are skipped. If the model is correct, the ratio is standard normal, except for the
+    datum.
     """
-    frames = [_long(getattr(tables, name), truth[name]) for name in ("interior", "georeferencing") if name in truth]
-    frames += [_wide(getattr(tables, k), truth[k], *names) for k, names in _WIDE.items() if k in truth]
-    empty = pd.DataFrame({c: pd.Series([], dtype=str if c == "parameter" else float) for c in _COLUMNS})
-    rows = pd.concat([f for f in frames if len(f)] or [empty], ignore_index=True)
+    empty = {name: pd.Series([], dtype=float) for name in ("estimate", "truth", "sigma")}
+    frames = [pd.DataFrame({"parameter": pd.Series([], dtype=str), **empty})]
+    for name in (name for name in ("interior", "georeferencing", "exterior", "object_points") if name in truth):
+        estimated, true = getattr(tables, name), truth[name]
+        if "value" in true:
+            keys = [c for c in ("camera", "parameter") if c in true]
+            both = estimated.merge(true, on=keys, suffixes=("", "_true"))
+            label = "interior[" + both["camera"].astype(str) + "]." if "camera" in both else ""
+            columns = {"estimate": both["value"], "truth": both["value_true"], "sigma": both["sigma"]}
+            frames.append(pd.DataFrame({"parameter": label + both["parameter"], **columns}))
+            continue
+        key, prefix = ("image", "exterior") if name == "exterior" else ("point", "points")
+        estimated, true = (t.assign(**{key: t[key].astype(str)}).set_index(key) for t in (estimated, true))
+        both, names = estimated.index.intersection(true.index, sort=False), list(true)
+        labels = [f"{prefix}[{one}].{column}" for one in both for column in names]
+        sides = {"estimate": estimated[names], "truth": true, "sigma": estimated[[f"sigma_{c}" for c in names]]}
+        columns = {side: table.loc[both].to_numpy(float).ravel() for side, table in sides.items()}
+        frames.append(pd.DataFrame({"parameter": labels, **columns}))
+    rows = pd.concat([f for f in frames if len(f)] or frames, ignore_index=True)
     rows = rows[rows["sigma"] > 0].reset_index(drop=True)
     error = rows["estimate"] - rows["truth"]
     error = error.where(~rows["parameter"].str.endswith("_deg"), (error + 180) % 360 - 180)
     cameras = tables.adjusted.unknowns.interior
     units = [label_unit(label, cameras) for label in rows["parameter"]]
-    return rows.assign(error=error, ratio=error / rows["sigma"], unit=np.array(units, object))[
-        ["parameter", "estimate", "truth", "error", "sigma", "ratio", "unit"]
-    ]
+    rows = rows.assign(error=error, ratio=error / rows["sigma"], unit=np.array(units, object))
+    return rows[["parameter", "estimate", "truth", "error", "sigma", "ratio", "unit"]]
 
 
 def recovery_spread(recovery: pd.DataFrame) -> pd.DataFrame:
@@ -551,28 +501,3 @@ def recovery_spread(recovery: pd.DataFrame) -> pd.DataFrame:
         "beyond_2_sigma": grouped.apply(lambda r: float(np.mean(np.abs(r) > 2))),
     }
     return pd.DataFrame(columns).reset_index(names="group")
-
-
-def _long(table: pd.DataFrame, truth: pd.DataFrame) -> pd.DataFrame:
-    """Compute the recovery of tables with one value per row: cameras, mounts and strips."""
-    keys = [c for c in ("camera", "parameter") if c in table and c in truth]
-    both = table.merge(truth, on=keys, suffixes=("", "_true"))
-    label = both["parameter"]
-    if "camera" in both:
-        label = "interior[" + both["camera"].astype(str) + "]." + label
-    columns = {"parameter": label, "estimate": both["value"], "truth": both["value_true"], "sigma": both["sigma"]}
-    return pd.DataFrame(columns)
-
-
-def _wide(table: pd.DataFrame, truth: pd.DataFrame, key: str, prefix: str) -> pd.DataFrame:
-    """Compute the recovery of tables with one row per image or point."""
-    names = [c for c in truth.columns if c != key]
-    both = table.assign(**{key: table[key].astype(str)}).merge(
-        truth.assign(**{key: truth[key].astype(str)}), on=key, suffixes=("", "_true")
-    )
-    label = np.array([f"{prefix}[{one}].{name}" for one in both[key] for name in names], object)
-    numbers = {
-        column: both[[pattern.format(n) for n in names]].to_numpy(float).ravel()
-        for column, pattern in (("estimate", "{}"), ("truth", "{}_true"), ("sigma", "sigma_{}"))
-    }
-    return pd.DataFrame({"parameter": label, **numbers})

@@ -1,6 +1,5 @@
 """Terminal output: verdict, sigma naught, interior orientation, residuals."""
 
-import numpy as np
 import pandas as pd
 from rich.console import Console
 from rich.text import Text
@@ -8,6 +7,7 @@ from rich.text import Text
 from jaxphoto.errors import counted, printable
 from jaxphoto.report.findings import MARKS, Verdict
 from jaxphoto.report.formatting import to_rich
+from jaxphoto.report.residual_findings import component_tables
 from jaxphoto.report.tables import Tables, check_spread, recovery_spread
 from jaxphoto.statistics import VarianceComponents
 
@@ -41,42 +41,28 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
     n, u = sum(adjusted.n_observations.values()), sum(adjusted.n_unknowns.values())
     console.print(plain(adjusted.block.title or "block"), style="bold")
     print_verdict(verdict, console)
+    constraints = f" + {adjusted.n_constraints} constraints" if adjusted.n_constraints else ""
     console.print(f"{adjusted.outcome.value} ({int(adjusted.steps)} iterations)")
     console.print(
-        f"sigma0 {float(adjusted.sigma0):.6g}   redundancy {adjusted.redundancy} = {n} observations"
-        + (f" + {adjusted.n_constraints} constraints" if adjusted.n_constraints else "")
-        + f" - {u} unknowns"
+        f"sigma0 {float(adjusted.sigma0):.6g}   redundancy {adjusted.redundancy} = {n} observations{constraints} - {u} "
+        "unknowns"
     )
-    if tables.significance:
-        rows = [(s.camera, s.parameter, s.value, s.sigma, s.unit, s.ratio, s.p_value) for s in tables.significance]
-        table = pd.DataFrame(
-            rows, columns=["camera", "parameter", "value", "sigma", "unit", "value / sigma", "p_value"]
-        )
-        console.print(to_rich(table, "interior orientation (a posteriori)"))
-    if len(tables.georeferencing):
-        console.print(to_rich(tables.georeferencing.head(_PARAMETERS), "mounts and strips (a posteriori)"))
-    console.print(to_rich(tables.residual_spread.drop(columns="mean"), "residuals"))
-    if len(points := tables.check_points):
-        spread = check_spread(points)
-        spread = spread[spread["n"] > 0].drop(columns="unit").rename(columns=lambda c: f"{c}_m" if c[0] in "mr" else c)
-        spreads = [(points[f"d{a}_m"], points[f"sigma_d{a}_m"]) for a in spread["axis"]]
-        spread["largest at"] = [str(points["point"].iloc[int(np.nanargmax(np.abs(d)))]) for d, _ in spreads]
-        spread["RMS / sigma"] = [f"{np.sqrt(np.nanmean((d / s) ** 2)):.2f}" for d, s in spreads]
-        console.print(to_rich(spread, "check points"))
-    if tables.truth:
-        recovery = recovery_spread(tables.recovery)
-        recovery["beyond_2_sigma"] = recovery["beyond_2_sigma"].map("{:.1%}".format)
-        console.print(to_rich(recovery, "(estimate - truth) / sigma"))
+    shown = {
+        "interior orientation (a posteriori)": tables.interior[tables.interior["sigma"].notna()],
+        "mounts and strips (a posteriori)": tables.georeferencing.head(_PARAMETERS),
+        "residuals": tables.residual_spread.drop(columns="mean"),
+        "check points": check_spread(tables.check_points) if len(tables.check_points) else tables.check_points,
+        "(estimate - truth) / sigma": recovery_spread(tables.recovery) if tables.truth else pd.DataFrame(),
+    }
+    for name, table in shown.items():
+        if len(table):
+            console.print(to_rich(table, name))
 
 
 def print_components(components: VarianceComponents, console: Console) -> None:
     """Print the variance component of each group."""
-    c = components
-    console.print(f"variance components, adjusted with them ({counted(c.iterations, 'iteration')}):")
-    for k, label in enumerate(c.labels):
-        factor = f"standard deviations x {c.factor[k] ** 0.5:.3g}, variances x {c.factor[k]:.3g} +- {c.sigma[k]:.2g}"
-        size = f"({counted(c.observations[k], 'observation')}, redundancy {c.redundancy[k]:.1f})"
-        console.print(plain(f"  {label}: {factor if c.supported[k] else 'as stated'} {size}"), soft_wrap=True)
+    table = component_tables(components)["variance_components"].drop(columns="degrees_of_freedom")
+    console.print(to_rich(table, f"variance components ({counted(components.iterations, 'iteration')})"))
 
 
 def print_warning(warning: str, console: Console, **options) -> None:

@@ -1,7 +1,7 @@
 """Verdict on an adjustment: findings on convergence, residuals, geometry and reliability."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -9,7 +9,6 @@ import jax
 import numpy as np
 
 from jaxphoto.adjustment import POOR, Adjustment, weaknesses_of, yardsticks
-from jaxphoto.block import Block
 from jaxphoto.camera import RollingShutter, Sensor, ThermalRates, get_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
@@ -55,7 +54,6 @@ _CURES = {
     "yp_mm": _FOR_POINT,
 }
 _FOR_DISTORTION = "image points towards the corners, more overlap or cross strips"
-_FOR_FIELD = "images rotated by 90 degrees about the line of sight, and tilted ones"
 # Rows of the correlations: horizontal position, height, tilts.
 _PLAN, _HEIGHT, _TILTS = slice(0, 2), slice(2, 3), slice(3, 5)
 _C, _POINT = ("c_mm",), ("xp_mm", "yp_mm")
@@ -77,7 +75,6 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     if adjusted.left_out:
         yield Finding("rejected", "warning", left_out_words(adjusted))
     yield from behind_findings(adjusted)
-    yield from duplicate_findings(adjusted.block)
     yield from residual_findings(tables)
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))
@@ -86,15 +83,14 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         yield from (w.finding for w in weak)
         explained = frozenset().union(*(w.explains for w in weak))
         felt = {name for name, moved in at_corner(tables, camera).items() if moved > FELT}
-        yield from _correlated(camera, c, explained, felt, _all_known(adjusted.block))
+        yield from _correlated(camera, c, explained, felt)
     yield from ground_findings(tables)
     yield from shutter_findings(tables)
     yield from drift_findings(tables)
     yield from (_not_significant(tables, s) for s in tables.significance if not s.significant)
     for name, sensor in adjusted.block.sensors.items():
         if not _invertible(adjusted, name, sensor):
-            hint = "Estimate fewer coefficients or measure more points in the corners"
-            yield Finding("distortion_not_invertible", "warning", camera_words(name), hint=hint)
+            yield Finding("distortion_not_invertible", "warning", camera_words(name))
     yield from reliability_findings(tables)
     yield from stretch_findings(adjusted)
 
@@ -102,14 +98,13 @@ def _findings(tables: Tables) -> Iterator[Finding]:
 def _not_converged(adjusted: Adjustment) -> Iterator[Finding]:
     yield Finding("not_converged", "error", adjusted.outcome.value)
     if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.diverged_points)]:
-        yield Finding("diverged_points", "error", few(names), len(names), hint="Check their image measurements")
+        yield Finding("diverged_points", "error", few(names), len(names))
     sigma0 = float(adjusted.sigma0)
     # Good fit without convergence indicates an undetermined direction, not poor initial values.
     if sigma0 <= NOTHING_FITS:
         yield from (Finding("undetermined", "error", w.sentence) for w in weaknesses_of(adjusted))
     elif np.isfinite(sigma0):
-        hint = "Run jaxphoto adjust --snoop to find contradicting observations and mistakes in files"
-        yield Finding("nothing_fits", "error", value=sigma0, limit=NOTHING_FITS, hint=hint)
+        yield Finding("nothing_fits", "error", value=sigma0, limit=NOTHING_FITS)
 
 
 def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
@@ -118,43 +113,11 @@ def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
     rows, seen = block.image_points, in_front(block, adjusted.unknowns)
     away = looking_away(block, seen)
     if names := [block.images[k] for k in away]:
-        hint = (
-            "The image is mirrored: x and y of its image points are exchanged or one has the wrong sign; if all images "
-            "are affected, the vertical direction is wrong"
-        )
-        yield Finding("mirrored_image", "error", few(names), len(names), hint=hint)
+        yield Finding("mirrored_image", "error", few(names), len(names))
     behind = np.flatnonzero(~seen & ~np.isin(rows.image, away))
     if len(behind):
         names = [f"{block.points[rows.point[k]]} in {block.images[rows.image[k]]}" for k in behind]
-        hint = "Remove them: their rays are nearly parallel or wrong"
-        yield Finding("points_behind", "warning", few(names), len(names), hint=hint)
-
-
-def duplicate_images(block: Block) -> list[tuple[str, str, int]]:
-    """Return pairs of images with mostly equal image points (to a tenth of sigma), and the number of equal points."""
-    least_count, least_fraction, tolerance = 4, 0.5, 0.1
-    rows = block.image_points
-    x, y = np.asarray(rows.xy).T
-    order = np.lexsort([rows.image, y, x, rows.point])
-    near = tolerance * np.asarray(rows.sigma).min(axis=1)[order][1:]
-    point, image, x, y = (v[order] for v in (rows.point, rows.image, x, y))
-    equal = (point[1:] == point[:-1]) & (image[1:] != image[:-1]) & (np.diff(x) <= near) & (abs(np.diff(y)) <= near)
-    pairs, count = np.unique(np.sort(np.stack([image[1:], image[:-1]])[:, equal], axis=0), axis=1, return_counts=True)
-    n_points = np.bincount(rows.image, minlength=len(block.images))
-    enough = (count >= least_count) & (count > least_fraction * n_points[pairs].max(axis=0))
-    return [
-        (block.images[a], block.images[b], int(n)) for (a, b), n in zip(pairs.T[enough], count[enough], strict=True)
-    ]
-
-
-def duplicate_findings(block: Block) -> Iterator[Finding]:
-    """Report the first pair of duplicate images, and the number of further pairs."""
-    if pairs := duplicate_images(block):
-        one, other, n = pairs[0]
-        others = f"; {len(pairs) - 1} further pairs" if len(pairs) > 1 else ""
-        hint = "Delete one of each pair: standard deviations are too small if both are used"
-        subject = f"{one} and {other}"
-        yield Finding("duplicate_images", "warning", subject, n, hint=hint, numbers={"others": others})
+        yield Finding("points_behind", "warning", few(names), len(names))
 
 
 # Weak geometry ---------------------------------------------------------------------------------------------------
@@ -286,82 +249,55 @@ def _not_significant(tables: Tables, s: Significance) -> Finding:
     return Finding("not_significant", "note", subject, s.p_value, SIGNIFICANCE_LEVEL, numbers={"effect": effect})
 
 
-def _all_known(block: Block) -> bool:
-    """Return True if all points have prior coordinates, as in a field of targets."""
-    return len(np.union1d(block.control.who, block.fixed.who)) == len(block.points)
-
-
 def _correlated(
-    camera: str, c: Correlations, explained: frozenset[tuple[str, str]], felt: set[str], field: bool
+    camera: str, c: Correlations, explained: frozenset[tuple[str, str]], felt: set[str]
 ) -> Iterator[Finding]:
-    """Report high correlations, except the pairs in `explained`.
-
-    A finding is a warning if the parameter affects the images (`felt`), otherwise a note. The cure depends on the
-    parameter and on whether all images show a `field` of known targets.
-    """
-    subject = camera_words(camera)
-
-    def finding(code: str, severity: Severity, value: float, pairs: Sequence[str], hint: str = "", **more: str):
-        numbers = {"pairs": few(pairs), **more}
-        limit = HIGH_OWN_CORRELATION if code == "correlation_image" else HIGH_CORRELATION
-        return Finding(code, severity, subject, value, limit, hint, numbers)
-
-    if pairs := high_pairs(c.parameters, c.interior, HIGH_CORRELATION):
-        names = [f"{symbol(a)} and {symbol(b)} {rho:+.3f}" for a, b, rho in pairs]
-        yield finding("correlation_interior", "note", pairs[0][2], names)
+    """Report high correlations, except the pairs in `explained`: a warning if the parameter affects the images."""
+    subject, limit = camera_words(camera), HIGH_CORRELATION
+    if pairs := high_pairs(c.parameters, c.interior, limit):
+        names = few([f"{symbol(a)} and {symbol(b)} {rho:+.3f}" for a, b, rho in pairs])
+        yield Finding("correlation_interior", "note", subject, pairs[0][2], limit, numbers={"pairs": names})
     if len(c.images) == 0:
         return
     expected = [[(e, p) in explained for p in c.parameters] for e in c.eop_names]
     worst = np.where(np.reshape(expected, c.max_abs.shape), 0.0, c.max_abs)
-    high = sorted(np.argwhere(worst > HIGH_CORRELATION).tolist(), key=lambda k: -worst[k[0], k[1]])
-    if high:
-        images = [c.images[int(np.abs(c.exterior[:, i, j]).argmax())] for i, j in high]
-        names = [
-            f"{c.eop_names[i]} with {symbol(c.parameters[j])} {worst[i, j]:.3f} (image {image})"
-            for (i, j), image in zip(high, images, strict=True)
-        ]
+    if high := sorted(np.argwhere(worst > limit).tolist(), key=lambda k: -worst[k[0], k[1]]):
+        names = few(
+            [
+                f"{c.eop_names[i]} with {symbol(c.parameters[j])} {worst[i, j]:.3f} "
+                f"(image {c.images[int(np.abs(c.exterior[:, i, j]).argmax())]})"
+                for i, j in high
+            ]
+        )
         weak = [p for p in dict.fromkeys(c.parameters[j] for _, j in high) if p in felt]
-        cures = [_FOR_FIELD] if field else list(dict.fromkeys(_CURES.get(p, _FOR_DISTORTION) for p in weak))
-        hint = f"Add {', or '.join(cures)}" if weak else f"Its effect on the image corners is below {FELT:g} sigma"
+        cures = " or ".join(dict.fromkeys(_CURES.get(p, _FOR_DISTORTION) for p in weak))
+        hint = f"Add {cures}" if weak else f"Its effect on the image corners is below {FELT:g} sigma"
         severity: Severity = "warning" if weak else "note"
-        yield finding("correlation_exterior", severity, float(worst.max()), names, hint)
+        numbers = {"pairs": names}
+        yield Finding("correlation_exterior", severity, subject, float(worst.max()), limit, hint, numbers)
     within = np.abs(c.within_image).max(axis=0)
-    strong = [(within[i, j], i, j) for i in range(6) for j in range(i) if within[i, j] > HIGH_OWN_CORRELATION]
+    strong = sorted((within[i, j], i, j) for i in range(6) for j in range(i) if within[i, j] > HIGH_OWN_CORRELATION)
     if strong:
-        names = [f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in sorted(strong)[::-1]]
-        reason = "usual without camera stations or attitudes, their effects on the ground cancel"
-        if field:
-            reason = "usual where targets alone orient an image, their effects cancel"
-        yield finding("correlation_image", "note", max(strong)[0], names, reason=reason)
+        names = few([f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in strong[::-1]])
+        numbers = {"pairs": names}
+        yield Finding("correlation_image", "note", subject, strong[-1][0], HIGH_OWN_CORRELATION, numbers=numbers)
 
 
 def ground_findings(tables: Tables) -> Iterator[Finding]:
     """Report correlations of c with heights, and of the camera with doming of the ground."""
-    flown, dome = len(tables.adjusted.block.stations.who) > 0, FORMS.index("dome")
     for camera, g in tables.ground_correlations.items():
-        sigma = tables.interior[tables.interior["camera"] == camera].set_index("parameter")["sigma"]
+        words, dome = camera_words(camera), float(g.together[FORMS.index("dome")])
         if "c_mm" in g.parameters:
             rho = g.rho[:2, g.parameters.index("c_mm")]
             k = int(np.abs(rho).argmax())
-            # Without stations, the block is terrestrial or its flying height is irrelevant.
-            height = flown or k == 0
-            above = "the flying height over the ground" if height else "the distance of the images from the points"
-            numbers = {
-                "what": "the height of the ground" if k == 0 else above, "length": "height" if height else "distance",
-                "sigma": sigma["c_mm"], "effect": abs(rho[k]) * g.sigma_m[k],
-            }  # fmt: skip
             if abs(rho[k]) > HIGH_CORRELATION:
-                hint = (
-                    "Known heights on the ground, another flying height or oblique images separate them"
-                    if flown
-                    else "Images from other distances, or tilted ones, separate them"
-                )
-                words = camera_words(camera)
-                yield Finding("ground_c", "note", words, float(rho[k]), HIGH_CORRELATION, hint, numbers)
-        if (rho_dome := float(g.together[dome])) > HIGH_CORRELATION:
-            hint = "Control in the middle and at the edge, oblique images or cross strips separate them"
-            numbers = {"effect": g.sigma_m[dome]}
-            yield Finding("ground_dome", "note", camera_words(camera), rho_dome, HIGH_CORRELATION, hint, numbers)
+                sigma = tables.interior.set_index(["camera", "parameter"])["sigma"][camera, "c_mm"]
+                what = ("the height of the ground", "the distance of the images from the ground")[k]
+                numbers = {"what": what, "sigma": sigma, "effect": abs(rho[k]) * g.sigma_m[k]}
+                yield Finding("ground_c", "note", words, float(rho[k]), HIGH_CORRELATION, numbers=numbers)
+        if dome > HIGH_CORRELATION:
+            numbers = {"effect": g.sigma_m[FORMS.index("dome")]}
+            yield Finding("ground_dome", "note", words, dome, HIGH_CORRELATION, numbers=numbers)
 
 
 def _invertible(adjusted: Adjustment, name: str, sensor: Sensor) -> bool:
@@ -393,8 +329,7 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
             continue
         known, words = float(prior.sigma), camera_words(camera)
         if sigma > little * known:
-            hint = "Another flying height, oblique images or known heights on the ground would determine it"
-            yield Finding("lens_prior_only", "warning", words, sigma, known, hint)
+            yield Finding("lens_prior_only", "warning", words, sigma, known)
         else:
             change = value - float(prior.value)
             numbers = {"change": change, "ratio": abs(change) / known}
@@ -428,52 +363,41 @@ def drift_findings(tables: Tables) -> Iterator[Finding]:
 
 def drift_finding(drift: CameraDrift) -> Finding:
     """Report the change of one camera: significant parameters if there are any, otherwise the MDBs."""
-    test = drift.change
+    test, names = drift.change, drift.parameters
     if drift.rates is ThermalRates:
         over = f"with its temperature over {drift.span:.2g} K"
     else:
         over = f"over {drift.span:.2g} h" if drift.span > 1.5 else f"over {60 * drift.span:.2g} min"
-    if not test.rejected:
-        return _drift(camera_words(drift.camera), over, test, _mdbs(drift.parameters, test.detectable.tolist()))
-    significant = [k for k, p in enumerate(test.p_values) if p < SIGNIFICANCE_LEVEL] or range(len(drift.parameters))
-    changes = ", ".join(
-        f"{_symbol(drift.parameters[k])} by {_signed(drift.parameters[k], test, k)}" for k in significant
-    )
-    return _drift(camera_words(drift.camera), over, test, changes)
+    significant = [k for k, p in enumerate(test.p_values) if p < SIGNIFICANCE_LEVEL] or range(len(names))
+    changes = [f"{_symbol(names[k])} by {_signed(names[k], test, k)}" for k in significant]
+    return _drift(camera_words(drift.camera), over, test, changes, dict(zip(names, test.detectable, strict=True)))
 
 
 def differences_finding(differences: CameraDifferences) -> Finding:
     """Report differences between the cameras of all strips, or between all knots of a spline."""
     test, names, spline = differences.more, np.array(differences.parameters), bool(differences.camera)
     words = camera_words(differences.camera) if spline else "the camera"
-    over = "from knot to knot of its spline" if spline else "from strip to strip"
-    each = [(name, np.flatnonzero(names == name)) for name in dict.fromkeys(differences.parameters)]
-    if not test.rejected:
-        return _drift(
-            words, over, test, _mdbs([n for n, _ in each], [float(test.detectable[k].max()) for _, k in each])
-        )
-    changes = []
-    for name, tables_of in each:
-        ends = (int(tables_of[end(test.value[tables_of])]) for end in (np.argmin, np.argmax))
-        place = "at {} min" if spline else "in strip {}"
+    over, place = ("from knot to knot of its spline", "at {} min") if spline else ("from strip to strip", "in strip {}")
+    changes, detectable = [], {}
+    for name in dict.fromkeys(differences.parameters):
+        rows = np.flatnonzero(names == name)
+        ends = (int(rows[end(test.value[rows])]) for end in (np.argmin, np.argmax))
         texts = (f"{_signed(name, test, k)} {place.format(differences.at[k])}" for k in ends)
         changes.append(f"{_symbol(name)} from {' to '.join(texts)}")
-    return _drift(words, over, test, ", ".join(changes))
+        detectable[name] = float(test.detectable[rows].max())
+    return _drift(words, over, test, changes, detectable)
 
 
-def _drift(subject: str, over: str, test: ZeroTest, changes: str) -> Finding:
-    numbers = {"over": over, "p": p_words(test.p_value), "changes": changes}
+def _drift(subject: str, over: str, test: ZeroTest, changes: list[str], mdb: Mapping[str, float]) -> Finding:
+    if not test.rejected:
+        sizes = ((name, *_scale(name, size), size) for name, size in mdb.items())
+        changes = [
+            f"{_symbol(name)} {of_sigma(factor * size) + unit if math.isfinite(size) else 'none'}"
+            for name, factor, unit, size in sizes
+        ]
+    numbers = {"over": over, "p": p_words(test.p_value), "changes": ", ".join(changes)}
     code = "drift" if test.rejected else "no_drift"
     return Finding(code, "note", subject, test.p_value, SIGNIFICANCE_LEVEL, numbers=numbers)
-
-
-def _mdbs(names: Sequence[str], sizes: Sequence[float]) -> str:
-    return ", ".join(
-        f"{_symbol(name)} {of_sigma(_scale(name, size)[0] * size)}{_scale(name, size)[1]}"
-        if math.isfinite(size)
-        else f"{_symbol(name)} none"
-        for name, size in zip(names, sizes, strict=True)
-    )
 
 
 def _signed(name: str, test: ZeroTest, k: int) -> str:
@@ -482,7 +406,7 @@ def _signed(name: str, test: ZeroTest, k: int) -> str:
 
 
 def _symbol(name: str) -> str:
-    return {"c": "c", "xp": "x_p", "yp": "y_p", "k1": "k1"}[name]
+    return {"xp": "x_p", "yp": "y_p"}.get(name, name)
 
 
 def _scale(name: str, size: float) -> tuple[float, str]:

@@ -20,10 +20,7 @@ from jaxphoto.statistics.correlation import (
 )
 from jaxphoto.statistics.covariance import EOP_NAMES, Covariance, Rotations, common_covariance, covariance
 from jaxphoto.statistics.discrepancy import (
-    LEAST_CHECK_POINTS,
     AxisErrors,
-    ComponentAccuracy,
-    PositionalAccuracy,
     Spread,
     a_priori_sigmas,
     angle_differences,
@@ -31,7 +28,6 @@ from jaxphoto.statistics.discrepancy import (
     observation_groups,
     physical_residuals,
     point_differences,
-    positional_accuracy,
     residual_spread,
     spread_of,
 )
@@ -96,7 +92,6 @@ __all__ = [
     "DELTA0",
     "EOP_NAMES",
     "LEAST_CHECKED",
-    "LEAST_CHECK_POINTS",
     "LEAST_SIGMA0",
     "LEVEL",
     "MAX_GROUPS",
@@ -109,7 +104,6 @@ __all__ = [
     "BlunderTest",
     "CameraDifferences",
     "CameraDrift",
-    "ComponentAccuracy",
     "Correlations",
     "Covariance",
     "EffectTerm",
@@ -123,7 +117,6 @@ __all__ = [
     "PartialRedundancy",
     "Partition",
     "Parts",
-    "PositionalAccuracy",
     "Redundancy",
     "Rotations",
     "Selection",
@@ -166,7 +159,6 @@ __all__ = [
     "partition_observations",
     "physical_residuals",
     "point_differences",
-    "positional_accuracy",
     "prepare_hat_matrix",
     "prepare_statistics",
     "redundancy_numbers",

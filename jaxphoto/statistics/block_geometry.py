@@ -165,46 +165,12 @@ class ImageLinks(NamedTuple):
     """Number of common object points of each pair."""
 
 
-class WeakLink(NamedTuple):
-    """Edge of the maximum spanning tree. Without it the two parts of the block have only weaker links."""
-
-    first: int
-    second: int
-    common: int
-    """Number of object points common to the two images."""
-    across: int
-    """Number of object points measured on both sides of the edge."""
-    side: Int[np.ndarray, "images"]
-    """Indices of the images on the smaller side of the edge."""
-
-
 def image_links(adjusted: Adjustment) -> ImageLinks:
     """List all pairs of images with at least one common object point."""
     measured = _measured(adjusted)
     common = scipy.sparse.triu(measured @ measured.T, k=1, format="coo")
     first, second = common.coords
     return ImageLinks(first.astype(int), second.astype(int), common.data.astype(int))
-
-
-def weak_links(adjusted: Adjustment, links: ImageLinks, most: int) -> list[WeakLink]:
-    """Return the `most` weakest edges of the maximum spanning tree, weakest first."""
-    n, measured = len(adjusted.block.images), _measured(adjusted)
-    # The maximum spanning tree of the common-point counts is the minimum spanning tree of their inverses.
-    ends = links.first.astype(np.int32), links.second.astype(np.int32)
-    length = scipy.sparse.coo_array((1.0 / links.common, ends), shape=(n, n))
-    tree = scipy.sparse.csgraph.minimum_spanning_tree(length.tocsr()).tocoo()
-    weak = []
-    for cut in np.argsort(-tree.data, kind="stable")[:most]:
-        first, second = (int(end[cut]) for end in tree.coords)
-        rest = np.arange(tree.nnz) != cut
-        apart = scipy.sparse.coo_array((tree.data[rest], [end[rest] for end in tree.coords]), shape=(n, n))
-        _, part = scipy.sparse.csgraph.connected_components(apart, directed=False)
-        one_side, other_side = (np.flatnonzero(part == part[end]) for end in (first, second))
-        seen = [np.asarray(measured[side].sum(axis=0)).ravel() > 0 for side in (one_side, other_side)]
-        common = round(1 / float(tree.data[cut]))
-        side = min(one_side, other_side, key=len)
-        weak.append(WeakLink(min(first, second), max(first, second), common, int((seen[0] & seen[1]).sum()), side))
-    return weak
 
 
 def _measured(adjusted: Adjustment) -> "scipy.sparse.csr_array":

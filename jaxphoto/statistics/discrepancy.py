@@ -1,17 +1,10 @@
-"""Residuals by group and axis, discrepancies at check points, differences between adjustments, positional accuracy.
+"""Residuals by group and axis, discrepancies at check points, differences between adjustments.
 
 Source: paper 000, Tables 3 (residual RMSE), 5 (check points), 6 and 7 (points and angles of two experiments).
 
-Positional accuracy by check points follows ASPRS Edition 2 and includes the error of the survey:
-
-    RMSE_H = sqrt(RMSE_x^2 + RMSE_y^2 + s_H^2),  RMSE_V = sqrt(RMSE_z^2 + s_V^2),  RMSE_3D = sqrt(RMSE_H^2 + RMSE_V^2)
-
-RMSE_x, RMSE_y, RMSE_z are root mean squares of the discrepancies at check points, s_H and s_V root mean squares of the
-survey's standard deviations. An accuracy class is an RMSE limit in centimetres. A claim requires at least 30 check
-points, and a mean error above 25 % of the RMSE requires an investigation. With few check points such a mean occurs by
-chance (with three points in 75 % of cases), so it must also exceed the limit of Student's t.
-
-Source: ASPRS Positional Accuracy Standards for Digital Geospatial Data, Edition 2, Version 1.0 (August 2023).
+A mean error of check points above 25 % of the RMSE requires an investigation (ASPRS Positional Accuracy Standards,
+Edition 2). With few check points such a mean occurs by chance (with three points in 75 % of cases), so it must also
+exceed the limit of Student's t.
 """
 
 import math
@@ -115,49 +108,10 @@ def _common(first: tuple[str, ...], second: tuple[str, ...]) -> tuple[tuple[str,
     return tuple(n for n, _, _ in common), [a for _, a, _ in common], [b for _, _, b in common]
 
 
-LEAST_CHECK_POINTS = 30
-"""Minimum number of check points for an accuracy claim (ASPRS)."""
 SUSPECT_MEAN = 0.25
 """Ratio of a mean error to the RMSE of its axis above which it requires an investigation (ASPRS)."""
 # Significance level of Student's t-test of the mean.
 _LEVEL = 0.05
-# Number of significant digits of an accuracy class in centimetres; the class is rounded up.
-_DIGITS = 2
-
-
-@pretty_repr
-class ComponentAccuracy(NamedTuple):
-    """Tested accuracy of one component; lengths in metres."""
-
-    name: str
-    """Component: horizontal, vertical or three-dimensional."""
-    symbol: str
-    n: int
-    """Number of check points surveyed along all axes of the component."""
-    fit_m: float
-    """Root mean square of surveyed minus computed, summed over the axes."""
-    survey_m: float
-    """Root mean square of the survey's standard deviations, summed over the axes; NaN if one of them is unknown."""
-
-    @property
-    def rmse_m(self) -> float:
-        """RMSE including the survey's standard deviations, if all of these are known."""
-        return math.hypot(self.fit_m, 0.0 if math.isnan(self.survey_m) else self.survey_m)
-
-    @property
-    def class_cm(self) -> float:
-        """Accuracy class: `rmse_m` in centimetres, rounded up to two significant digits."""
-        cm = 100 * self.rmse_m
-        if cm == 0:
-            return 0.0
-        step = 10.0 ** (math.floor(math.log10(cm)) + 1 - _DIGITS)
-        # Round to nine digits first: the rounding error of the root must not raise the class.
-        return float(f"{math.ceil(round(cm / step, 9)) * step:.10g}")
-
-    @property
-    def claimed(self) -> bool:
-        """True with at least `LEAST_CHECK_POINTS` check points and all sigmas of their survey."""
-        return self.n >= LEAST_CHECK_POINTS and not math.isnan(self.survey_m)
 
 
 @pretty_repr
@@ -176,44 +130,3 @@ class AxisErrors(NamedTuple):
             return False
         scatter = math.sqrt(max(self.rmse_m**2 - self.mean_m**2, 0.0) / (self.n - 1))
         return abs(self.mean_m) > student_limit(self.n - 1, _LEVEL) * scatter
-
-
-@pretty_repr
-class PositionalAccuracy(NamedTuple):
-    """Accuracy of an adjusted block at its check points."""
-
-    tested: tuple[ComponentAccuracy, ...]
-    """Horizontal, vertical and three-dimensional accuracy, if check points have these axes."""
-    axes: tuple[AxisErrors, ...]
-
-
-def positional_accuracy(discrepancies: ControlCoordinates) -> PositionalAccuracy:
-    """Compute positional accuracy from `discrepancies`: surveyed minus computed, with the survey's sigmas.
-
-    See `check_discrepancies`. A sigma of zero means unknown.
-    """
-    points, row = np.unique(discrepancies.who, return_inverse=True)
-    error, sigma = np.full((2, len(points), 3), np.nan)
-    error[row, discrepancies.axis] = np.asarray(discrepancies.value, float)
-    survey = np.asarray(discrepancies.sigma, float)
-    sigma[row, discrepancies.axis] = np.where(survey > 0, survey, np.nan)
-    horizontal = _tested("horizontal", "RMSE_H", error[:, :2], sigma[:, :2])
-    vertical = _tested("vertical", "RMSE_V", error[:, 2:], sigma[:, 2:])
-    combined = [math.hypot(h, v) for h, v in zip(horizontal[3:], vertical[3:], strict=True)]
-    spatial = ComponentAccuracy("three-dimensional", "RMSE_3D", min(horizontal.n, vertical.n), *combined)
-    axes = []
-    for k, axis in enumerate(AXES):
-        d = error[np.isfinite(error[:, k]), k]
-        if len(d):
-            axes.append(AxisErrors(axis, len(d), float(d.mean()), float(np.sqrt((d**2).mean()))))
-    return PositionalAccuracy(tuple(t for t in (horizontal, vertical, spatial) if t.n), tuple(axes))
-
-
-def _tested(
-    name: str, symbol: str, error: Float[np.ndarray, "points axes"], sigma: Float[np.ndarray, "points axes"]
-) -> ComponentAccuracy:
-    complete = np.isfinite(error).all(axis=1)
-    if not complete.any():
-        return ComponentAccuracy(name, symbol, 0, math.nan, math.nan)
-    rms = lambda v: math.sqrt(float((v[complete] ** 2).sum(axis=1).mean()))  # noqa: E731
-    return ComponentAccuracy(name, symbol, int(complete.sum()), rms(error), rms(sigma))

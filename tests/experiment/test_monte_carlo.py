@@ -45,7 +45,7 @@ def whole(tmp_path_factory):
 def test_the_promised_files_and_columns(whole):
     directory, (summary, table) = whole
     assert {p.name for p in directory.iterdir()} == {
-        "draws.parquet", "summary.csv", "summary.json", "effects.csv", "interior.png", "effects.png", "run.json",
+        "draws.parquet", "summary.csv", "summary.json", "effects.csv", "run.json",
     }  # fmt: skip
     draws = pd.read_parquet(directory / "draws.parquet")
     assert list(draws["draw"]) == list(range(1100))
@@ -87,30 +87,6 @@ def test_a_stopped_run_continues_to_the_same_file(whole, tmp_path, at):
     assert (tmp_path / "run" / "draws.parquet").read_bytes() == (directory / "draws.parquet").read_bytes()
     assert (tmp_path / "run" / "summary.csv").read_bytes() == (directory / "summary.csv").read_bytes()
     assert not (tmp_path / "run" / "parts").exists()
-
-
-def test_partial_results_are_summarised_during_a_run(whole, tmp_path, monkeypatch):
-    def stop(done: int) -> None:
-        if done >= 1030:
-            raise Stop
-
-    monkeypatch.setattr("jaxphoto.experiment.monte_carlo_run._SECONDS", 0.0)
-    with pytest.raises(Stop):
-        study(tmp_path / "run").draw(stop)
-    directory, (_, table) = whole
-    so_far = json.loads((tmp_path / "run" / "summary.json").read_text())
-    kept = len(pd.read_parquet(tmp_path / "run" / "parts"))
-    assert so_far["draws"] == so_far["converged"] == kept >= 100
-    assert so_far["draws_asked_for"] == 1100
-    first = pd.read_parquet(directory / "draws.parquet")[:kept]
-    found = pd.read_csv(tmp_path / "run" / "summary.csv").set_index("quantity")
-    assert list(found.index) == list(table["quantity"])
-    assert found.loc["one.c_mm", "sd"] == pytest.approx(first["one.c_mm"].std(), rel=1e-12)
-    assert (tmp_path / "run" / "interior.png").exists()
-    # Stopped again where all is drawn and nothing summed up yet: what was on the way is not taken for all.
-    study(tmp_path / "run").draw()
-    assert study(tmp_path / "run").write()[0]["draws"] == 1100
-    assert (tmp_path / "run" / "summary.csv").read_bytes() == (directory / "summary.csv").read_bytes()
 
 
 def test_of_a_large_block_every_batch_is_kept(tmp_path, monkeypatch):
@@ -195,7 +171,6 @@ def test_a_block_that_estimates_no_camera(tmp_path):
     summary, table = made.write()
     assert summary["converged"] == 3
     assert (table["quantity"].str.startswith("point.")).any()
-    assert not (tmp_path / "run" / "interior.png").exists()
 
 
 @pytest.mark.slow

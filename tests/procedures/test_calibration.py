@@ -18,7 +18,7 @@ from jaxphoto.procedures.calibration import (
 from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion
 from jaxphoto.procedures.calibration.target_block import projections
 from jaxphoto.procedures.calibration.target_calibration import added_sigma, eccentricities
-from jaxphoto.report.target_calibration import findings
+from jaxphoto.report.photographs import findings
 from tests.derivatives import compiled
 
 SENSOR = Sensor(1280, 960, 0.0054)

@@ -161,7 +161,7 @@ def test_the_command_writes_cells_and_cuts(field, tmp_path, monkeypatch, capsys)
     sigma = np.sqrt(np.diag(read_camera_file(out).covariance))
     expected = np.sqrt(np.diag(covariance(own).of_interior("one", parameter_names(own.unknowns.interior["one"]))))
     np.testing.assert_allclose(sigma, expected * max(factor, 1.0), rtol=1e-6)
-    assert {path.name for path in out.iterdir()} >= {"halves.png", "report.html", "summary.json"}
+    assert {path.name for path in out.iterdir()} >= {"report.html", "summary.json"}
     code, _, error = run(monkeypatch, capsys, *command, "--by", "strip")
     assert (code, "image i0 has no strip" in error) == (2, True)
 

@@ -256,7 +256,7 @@ def test_command_writes_the_table_and_says_the_choice(block, perfect, tmp_path, 
     assert rows[1]["smaller"] == "brown:k1"
     assert json.loads((out / "summary.json").read_text())["by_bic"] == "brown:k1+k2"
     assert {p.name for p in out.iterdir()} == {
-        MARKER, "models.csv", "parameters.csv", "models.png", "report.html", "summary.json",
+        MARKER, "models.csv", "parameters.csv", "report.html", "summary.json",
     }  # fmt: skip
     with (out / "parameters.csv").open() as file:
         first = next(csv.DictReader(file))

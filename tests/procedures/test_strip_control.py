@@ -242,7 +242,7 @@ def test_control_from_a_file(on_the_map, tmp_path, monkeypatch, capsys):
     given = ("--control", folder / "control.csv", "--cell-m", "2", "--roughness-m", "0.04")
     code, output, errors = run(monkeypatch, capsys, "strips", folder / "cloud.laz", "--out", out, *given)
     assert code == 0, errors + output
-    assert "control and strip 1: gap " in output and " of control, " in output
+    assert "gaps of strips" in output and " of control, " in output
     moved = clouds.read_cloud(folder / "cloud.laz").xyz - clouds.read_cloud(out / "cloud.laz").xyz
     strip = clouds.read_cloud(out / "cloud.laz").strip
     for k, shift in enumerate((COMMON, COMMON + SHIFT)):

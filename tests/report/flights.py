@@ -14,8 +14,7 @@ from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation import Oriented
 from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport
 from jaxphoto.report.findings import Finding, Verdict
-from jaxphoto.report.flight import FlightSource
-from jaxphoto.report.flight_plots import PartReport
+from jaxphoto.report.flight import FlightSource, PartReport
 from jaxphoto.statistics.block_geometry import coverage
 from jaxphoto.writing import InputFile
 from tests.blocks import BROWN, adjusted
@@ -51,13 +50,10 @@ def part_report() -> PartReport:
 
 
 def source() -> FlightSource:
-    """Times two seconds apart, with ten seconds in the middle; a photograph and another file as inputs."""
-    images = part_report().part.adjusted.block.images
-    at = 2.0 * np.arange(len(images)) + np.where(np.arange(len(images)) >= 5, 8.0, 0.0)
+    """A photograph and another file as inputs."""
     return FlightSource(
         ("positions are of EXIF",), "c is the focal length of EXIF.", BROWN,
-        {name: (float(t), 0.01) for name, t in zip(images, at, strict=True)},
         (Conditions("i0", "i0.jpg", "0" * 64, time="2024-05-01 10:00:00"),),
         (InputFile("i0.jpg", 3, "0" * 64), InputFile("survey.csv", 5, "ab" * 32)),
-        {"method": {"command": "fly", "features": 500, "epsg": None}}, "2024-05-02", "jaxphoto fly photographs",
+        {"method": {"command": "fly", "features": 500, "epsg": None}}, "jaxphoto fly photographs",
     )  # fmt: skip

@@ -15,7 +15,7 @@ from jaxphoto.observations import KnownParameters
 from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
 from jaxphoto.report.results import convergence_words
 from jaxphoto.report.tables import convergence_table, side_by_side, with_correlated_sigma
-from jaxphoto.report.verdict import duplicate_findings, duplicate_images, lens_findings, shutter_findings
+from jaxphoto.report.verdict import lens_findings, shutter_findings
 from tests.blocks import SENSOR, adjusted, simulated
 
 LENS = KnownLens(InteriorOrientation(35.0, 0.0, 0.0, Brown()), lens_prior("Canon", "Canon EOS 5D"), 0.01)
@@ -98,28 +98,6 @@ def test_side_by_side_stands_what_the_long_table_says():
     assert wide["exterior"].tolist() == table["exterior"].unique().tolist()
     one = table[(table["exterior"] == "omega") & (table["interior"] == "yp_mm")]["max_abs_rho"].item()
     assert wide.set_index("exterior").loc["omega", "yp"] == f"{one:.3f}"
-
-
-def test_duplicated_images_are_reported():
-    block = simulated("cross").block
-    assert duplicate_images(block) == []
-    rows = block.image_points
-    xy = np.array(rows.xy)
-    n = 0
-    for k in np.flatnonzero(rows.image == 1):
-        for other in np.flatnonzero((rows.image == 0) & (rows.point == rows.point[k])):
-            xy[k] = xy[other]
-            n += 1
-    doubled = block.with_observations({"image_points": dataclasses.replace(rows, xy=xy)})
-    assert duplicate_images(doubled) == [(*sorted(block.images[:2]), n)]
-    (finding,) = duplicate_findings(doubled)
-    assert finding.value == n
-    # Written with fewer digits, it is the same photograph; measured anew, it is another observation.
-    rng, sigma, mine = np.random.default_rng(3), np.asarray(rows.sigma), (rows.image == 1)[:, None]
-    for part, told in ((0.05, True), (1.0, False)):
-        moved = xy + mine * part * sigma * rng.uniform(-1, 1, xy.shape)
-        again = block.with_observations({"image_points": dataclasses.replace(rows, xy=moved)})
-        assert bool(duplicate_images(again)) == told
 
 
 def test_sigma_naught_falls_from_that_of_the_start_to_that_of_the_optimum():

@@ -6,7 +6,7 @@ import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto import Tables, adjust, covariance, significance
+from jaxphoto import Tables, adjust, covariance, significance, statistics
 from jaxphoto.camera import get_parameter, set_parameter
 from jaxphoto.observations.priors import KnownParameters
 from jaxphoto.report import residual_findings, verdict_of
@@ -204,7 +204,7 @@ def test_uncontrolled_observations_are_reported(monkeypatch):
         LargestMdb("stations", "station A in X", np.inf, 0.1, "m"),
         LargestMdb("stations", "station B in X", 2.0, 0.1, "m"),
     ]
-    monkeypatch.setattr(residual_findings, "largest_mdbs", lambda adjusted, redundancy: hidden)
+    monkeypatch.setattr(statistics, "largest_mdbs", lambda adjusted, redundancy: hidden)
     *_, one, other = residual_findings.reliability_findings(Tables(adjusted("cross")))
     assert (one.code, one.subject) == ("unchecked", "station A in X")
     assert (other.code, other.subject) == ("mdb", "station B in X")

@@ -4,7 +4,6 @@ import re
 from pathlib import Path
 
 import numpy as np
-import pandas as pd
 import pytest
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
@@ -12,21 +11,18 @@ from matplotlib.quiver import Quiver
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.procedures.control import ControlledBlock
 from jaxphoto.procedures.control.marks import Marked
-from jaxphoto.report.findings import as_sentence, p_words
+from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.flight import (
     axis_cell,
     flight_page,
     flight_summary,
-    in_order,
     offset_statistics,
+    plot_position_offsets,
     positions_section,
     provenance_section,
-    time_sentences,
 )
-from jaxphoto.report.flight_plots import plot_position_offsets, quantities_in_time, time_line
-from jaxphoto.report.plots import draw_network, plot_density, strength_classes
+from jaxphoto.report.plots import plot_density
 from jaxphoto.report.results import interior_table
-from jaxphoto.statistics.block_geometry import ImageLinks
 from tests.blocks import BROWN
 from tests.report.flights import OFFSETS_M, VERDICT, part_report, source
 
@@ -52,7 +48,7 @@ def test_the_documentation_lists_the_sections_of_the_page(page):
     document = (
         (Path(__file__).parents[2] / "docs" / "report.md").read_text(encoding="utf-8").split("## Report of a flight")[1]
     )
-    listed = re.findall(r"^\| ([^|]+) \|", document.split("\n\nThe rms")[0], re.MULTILINE)[2:]
+    listed = re.findall(r"^\| ([^|]+) \|", document.split("\n\nEquivalent terms")[0], re.MULTILINE)[2:]
     assert [t for t in told if t not in ("Part 2", "Files")] == [t for t in listed if t in told]
     # Sections of blocks with control, check points, more than one mount, or variance components.
     optional = {"Mounts and strips", "Control points", "Check points: surveyed minus computed", "Variance components"}
@@ -97,14 +93,6 @@ def test_offsets_by_axis():
     assert len(offset_statistics(table[table["position"] == "none"])) == 0
 
 
-def test_steps_of_white_offsets_scatter_as_they_do_and_of_drift_less():
-    rng, n = np.random.default_rng(1), 2000
-    white, drift = rng.normal(0, 0.1, n), np.linspace(-1, 1, n)
-    table = pd.DataFrame({"image": [str(k) for k in range(n)], "dX_m": white, "dY_m": drift, "dZ_m": white})
-    found = offset_statistics(table).set_index("axis")
-    assert found.loc["X", "rms_of_steps_m"] == pytest.approx(0.1, rel=0.1) and found.loc["Y", "rms_of_steps_m"] < 0.01
-
-
 def test_residuals_of_positions_are_held_against_their_sigmas():
     report = part_report()
     *_, rows = positions_section(report, source())
@@ -122,21 +110,6 @@ def test_arrows_are_offsets_of_used_and_rejected_positions():
     np.testing.assert_allclose(np.stack([used.U, used.V], 1), OFFSETS_M[:3, :2] - mean)
     np.testing.assert_allclose(np.stack([left.U, left.V], 1), OFFSETS_M[3:, :2] - mean)
     assert used.scale == left.scale
-
-
-def test_gaps_and_speed_by_time():
-    report, taken = part_report(), source().taken
-    line = time_line(report, taken)
-    assert line.timed and np.flatnonzero(line.gap).tolist() == [4] and line.usual == pytest.approx(2.0)
-    # The first strip is flown in even steps of 210 m along X.
-    position = np.asarray(report.part.adjusted.unknowns.exterior.position)
-    way = np.linalg.norm(np.diff(position[:5], axis=0), axis=1) / 2.0
-    assert way.min() - 3 < np.nanmin(line.speed[:5]) and np.nanmax(line.speed[:5]) < way.max() + 3
-    # Names in another order than times are put in order; without times there is neither speed nor gap.
-    turned = {name: (-t, step) for name, (t, step) in taken.items()}
-    assert time_line(report, turned).order.tolist() == line.order.tolist()[::-1]
-    without = time_line(report, {})
-    assert not without.timed and not without.gap.any() and np.isnan(without.speed).all()
 
 
 def test_density_counts_every_image_point():
@@ -157,45 +130,6 @@ def test_points_of_more_rays_are_surer():
     assert few["angle_deg"].median() < many["angle_deg"].median()
 
 
-def test_classes_of_links_are_whole_numbers_from_one():
-    assert strength_classes(np.array([1, 900])) == [1, 5, 21, 98, 450]
-    assert strength_classes(np.array([1, 1])) == [1]
-
-
-def test_the_picture_of_a_network_says_that_links_are_left_out_and_keeps_its_lines_thin():
-    report = part_report()
-    n = len(report.images)
-    links = ImageLinks(np.tile(np.arange(n - 1), 3000), np.tile(np.arange(1, n), 3000), np.full(3000 * (n - 1), 7))
-    many, one = Figure().subplots(), Figure().subplots()
-    station = np.asarray(report.part.adjusted.unknowns.exterior.position)[:, :2]
-    draw_network(many, station, links, [])
-    draw_network(one, station, ImageLinks(*(v[: n - 1] for v in links)), [])
-    total = len(links.common)
-    # One in so many that no more than 2000 are drawn.
-    assert many.get_title("left").endswith(f": {-(-total // -(-total // 2000))} of {total} links")
-    assert "links" not in one.get_title("left")
-    width = [max(line.get_linewidth() for line in axes.lines if line.get_linestyle() == "-") for axes in (many, one)]
-    assert width[0] < width[1] / 5
-
-
-def test_clocks_of_whole_seconds_make_no_gaps():
-    report = part_report()
-    taken = {name: (float(int(0.45 * k)), 1.0) for k, name in enumerate(report.images["image"])}
-    line = time_line(report, taken)
-    assert line.usual == 1.0 and not line.gap.any()
-    # All within one step of the clock: nothing is usual.
-    assert not time_line(report, dict.fromkeys(taken, (5.0, 1.0))).gap.any()
-    sentences = list(time_sentences(time_line(report, dict.fromkeys(taken, (5.0, 1.0))), tuple(taken)))
-    assert sentences[0] == "Duration 0 s." and sentences[1].endswith(": 0.")
-
-
-def test_heights_that_are_not_known_are_no_picture():
-    report = part_report()
-    without = report._replace(coverage=report.coverage._replace(height_m=np.full(len(report.images), np.nan)))
-    line = time_line(report, source().taken)
-    assert set(quantities_in_time(report, line)) - set(quantities_in_time(without, line)) == {"height"}
-
-
 def test_the_summary_has_the_rows_of_every_part():
     report = part_report()
     rows = flight_summary([report._replace(coverage=None), report], 9).set_index("quantity")
@@ -206,31 +140,6 @@ def test_the_spread_of_surveyed_points_is_of_those_that_have_the_axis():
     assert axis_cell(np.full(2, np.nan), np.nan) == ""
     assert axis_cell(np.array([0.25, np.nan]), 0.25) == "+0.250 / - / 0.250"
     assert axis_cell(np.array([0.1, np.nan, 0.3]), 0.2236) == f"+0.200 / {np.sqrt(0.02):.3f} / 0.224"
-
-
-def test_a_smaller_part_tells_its_surveyed_points_and_its_lens():
-    report = part_report()
-    off = np.array([[0.1, 0.2, np.nan], [0.3, 0.2, np.nan]])
-    marks = Marked(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
-    nothing = np.full((2, 3), np.nan)
-    found = ControlledBlock(
-        report.part.adjusted, ("q1", "q2"), np.zeros(2, bool), ("control", "control"), (3, 3), nothing, off, nothing,
-        nothing, nothing, marks, np.zeros((0, 2)), ("two points were surveyed",),
-    )  # fmt: skip
-    part = report.part._replace(controlled=found, lens=("the lens is of a class",))
-    html = flight_page([report, report._replace(part=part)], {}, {}, VERDICT, source(), ["r", "r2"])
-    after = html[html.index(">Part 2</h2>") :]
-    assert "Two points were surveyed." in after and "The lens is of a class." in after
-    assert "+0.200 / 0.141 / 0.224" in after and not re.search(r"\bnan\b", after)
-
-
-def test_offsets_are_in_the_order_of_times_where_all_are_known():
-    table = part_report().images[:3]
-    taken = {"i0": (3.0, 1.0), "i1": (1.0, 1.0), "i2": (2.0, 1.0)}
-    assert in_order(table, taken)[0]["image"].tolist() == ["i1", "i2", "i0"]
-    del taken["i1"]
-    same, order = in_order(table, taken)
-    assert same is table and "block" in order
 
 
 def test_provenance_is_silent_of_what_photographs_do_not_say():
@@ -256,5 +165,17 @@ def test_a_maker_within_the_model_name_is_not_repeated(make, model, camera):
     assert Conditions("i", "i.jpg", "0" * 64, make=make, model=model).camera == camera
 
 
-def test_p_values_are_never_zero():
-    assert p_words(0.0) == "p < 1e-300" and p_words(0.0123, 2) == "p = 0.012"
+def test_a_smaller_part_tells_its_surveyed_points_and_its_lens():
+    report = part_report()
+    off = np.array([[0.1, 0.2, np.nan], [0.3, 0.2, np.nan]])
+    marks = Marked(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 2)), np.zeros(0))
+    nothing = np.full((2, 3), np.nan)
+    found = ControlledBlock(
+        report.part.adjusted, ("q1", "q2"), np.zeros(2, bool), ("control", "control"), (3, 3), nothing, off, nothing,
+        nothing, nothing, marks, np.zeros((0, 2)), ("two points were surveyed",),
+    )  # fmt: skip
+    part = report.part._replace(controlled=found, lens=("the lens is of a class",))
+    html = flight_page([report, report._replace(part=part)], {}, {}, VERDICT, source(), ["r", "r2"])
+    after = html[html.index(">Part 2</h2>") :]
+    assert "Two points were surveyed." in after and "The lens is of a class." in after
+    assert "+0.200 / 0.141 / 0.224" in after and not re.search(r"\bnan\b", after)

@@ -1,21 +1,19 @@
-"""Pages are self-contained, complete without a script, and print; the 3-D view has the numbers of the block."""
+"""Pages are self-contained, complete without a script, and print."""
 
 import re
 import shutil
 import subprocess
-import sys
 
-import equinox as eqx
 import numpy as np
 import pandas as pd
 import pytest
 
 from jaxphoto import Tables
-from jaxphoto.report import block_in_space, report_page, verdict_of
-from jaxphoto.report.block_plot import ellipsoid_mesh, places_of, pyramids
+from jaxphoto.report import report_page, verdict_of
+from jaxphoto.report.block_plot import places_of, pyramids
 from jaxphoto.report.findings import as_sentence, in_symbols
 from jaxphoto.report.page import Heading, Paragraph, Plot, html, page
-from tests.blocks import adjusted, simulated
+from tests.blocks import adjusted
 
 BROWSER = shutil.which("chromium") or shutil.which("google-chrome")
 NEEDS_BROWSER = pytest.mark.skipif(BROWSER is None, reason="no Chromium to open the page with")
@@ -31,52 +29,6 @@ def report(tables):
     return report_page(tables, verdict_of(tables))
 
 
-def traces(figure) -> dict:
-    return {trace.name.split(",")[0]: trace for trace in figure.data}
-
-
-def test_the_3d_view_has_what_the_block_has(tables):
-    a = tables.adjusted
-    found = traces(block_in_space(a, tables.covariance))
-    stations = np.stack([found["camera stations"][axis] for axis in "xyz"], axis=1)
-    np.testing.assert_allclose(stations, np.asarray(a.unknowns.exterior.position), rtol=1e-6, atol=1e-3)
-    assert tuple(found["camera stations"].text) == a.block.images
-    shown = [*found["object points"].text, *found["control points"].text, *found["check points"].text]
-    assert sorted(shown) == sorted(a.block.points)
-    assert {"images", "observed minus adjusted positions", "error ellipsoids"} <= set(found)
-    start = traces(block_in_space(simulated("cross").block))
-    assert "camera stations" in start and "error ellipsoids" not in start
-
-
-@pytest.mark.parametrize("name", ["fixed_interior", "inner", "everything"])
-def test_blocks_of_any_kind_have_a_3d_view(name):
-    a = adjusted(name)
-    found = traces(block_in_space(a, Tables(a).covariance))
-    assert ("observed minus adjusted positions" in found) == bool(len(a.block.stations.who))
-
-
-def test_diverged_points_and_huge_ellipsoids_are_no_obstacle(tables):
-    points = np.asarray(tables.adjusted.unknowns.points).copy()
-    points[:3] = [np.nan, np.inf, 1e200]
-    lost = eqx.tree_at(lambda a: a.unknowns.points, tables.adjusted, points)
-    assert len(block_in_space(lost, tables.covariance).to_json()) > 1000
-    covariances = np.array(tables.covariance.points)
-    covariances[:2] *= 1e6
-    wild = eqx.tree_at(lambda c: c.points, tables.covariance, covariances)
-    assert any("too large to show" in trace.name for trace in block_in_space(tables.adjusted, wild).data)
-
-
-def test_coordinates_far_from_zero_are_relative_to_a_round_origin(tables):
-    of = lambda a: (a.unknowns.points, a.unknowns.exterior.position)  # noqa: E731
-    shift = np.array([512_000.0, 5_403_000.0, 0.0])
-    far = eqx.tree_at(of, tables.adjusted, [np.asarray(v) + shift for v in of(tables.adjusted)])
-    figure = block_in_space(far)
-    less = float(re.fullmatch(r"X - (\d+) \[m\]", figure.layout.scene.xaxis.title.text)[1])
-    assert figure.layout.scene.zaxis.title.text == "Z [m]"
-    x = traces(figure)["camera stations"].x
-    np.testing.assert_allclose(x, np.asarray(far.unknowns.exterior.position)[:, 0] - less, atol=1e-3)
-
-
 def test_a_pyramid_opens_towards_the_points_of_its_image(tables):
     a = tables.adjusted
     s = a.structure
@@ -84,20 +36,6 @@ def test_a_pyramid_opens_towards_the_points_of_its_image(tables):
     for image, line in enumerate(pyramids(a, places_of(a), 10**6)):
         centre, corners = line[5], line[:4]
         assert ((seen[s.image == image] - centre) @ (corners.mean(axis=0) - centre) > 0).all()
-
-
-def test_ellipsoids_have_the_size_and_directions_of_their_covariance():
-    rng = np.random.default_rng(1)
-    root = rng.normal(size=(5, 3, 3))
-    covariance, centre = root @ root.transpose(0, 2, 1), rng.normal(size=(5, 3))
-    corners, triangles = ellipsoid_mesh(centre, covariance)
-    d = corners.reshape(5, -1, 3) - centre[:, None]
-    np.testing.assert_allclose(np.einsum("nci,nij,ncj->nc", d, np.linalg.inv(covariance), d), 1.0)
-    # A closed surface: every edge belongs to two triangles, in opposite senses.
-    edges = [tuple(edge) for t in triangles for edge in (t[:2], t[1:], t[[2, 0]])]
-    assert len(set(edges)) == len(edges) and {(b, a) for a, b in edges} == set(edges)
-    flat, _ = ellipsoid_mesh(np.zeros((1, 3)), np.diag([4.0, 1.0, 0.0])[None])
-    assert np.abs(flat[:, 2]).max() == 0 and np.abs(flat[:, 0]).max() <= 2
 
 
 def test_a_report_opens_with_verdict_and_summary_and_is_self_contained(tables, report):
@@ -111,11 +49,6 @@ def test_a_report_opens_with_verdict_and_summary_and_is_self_contained(tables, r
     assert all(f">{name}</td>" in report for name in tables.adjusted.block.images)
     labels = re.findall(r'<figure role="img" aria-label="([^"]{10,})"><svg', report)
     assert len(labels) > 10 and len(labels) == report.count('<figure role="img"')
-
-
-def test_without_plotly_a_report_has_the_plan_alone(tables, monkeypatch):
-    monkeypatch.setitem(sys.modules, "plotly.graph_objects", None)
-    assert "Plotly" not in report_page(tables, verdict_of(tables))
 
 
 def test_figures_are_the_same_bytes_each_time():

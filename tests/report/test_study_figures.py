@@ -8,20 +8,11 @@ from matplotlib.quiver import Quiver
 
 from jaxphoto import InputError
 from jaxphoto.lidar.raster import Raster
-from jaxphoto.report import (
-    plot_draws,
-    plot_effects,
-    plot_photograph_residuals,
-    plot_position_offsets,
-    plot_sensitivity,
-    plot_strip_differences,
-    plot_time_line,
-)
+from jaxphoto.report import plot_draws, plot_effects, plot_position_offsets, plot_sensitivity, plot_strip_differences
 from jaxphoto.report.formatting import without_empty
 from jaxphoto.report.sensitivity import SensitivityTables
-from jaxphoto.report.strips import differences_figure
 from tests.blocks import adjusted
-from tests.report.flights import OFFSETS_M, part_report, source
+from tests.report.flights import part_report
 
 
 @pytest.fixture
@@ -31,36 +22,16 @@ def axes():
 
 def test_offsets_are_recorded_minus_adjusted_less_their_mean(axes):
     report = part_report()
-    assert plot_position_offsets(report, axes, upright=True) is axes
-    heights = OFFSETS_M[:, 2] - OFFSETS_M[:3, 2].mean()
-    np.testing.assert_allclose([bar.get_height() for bar in axes.patches], heights)
-    plan = plot_position_offsets(report, Figure().add_subplot())
+    plan = plot_position_offsets(report, axes)
     assert any(np.abs(child.U).max() > 5 for child in plan.get_children() if isinstance(child, Quiver) and len(child.U))
     with pytest.raises(InputError, match="no recorded position of this part is used"):
         plot_position_offsets(report._replace(part=report.part._replace(placed=None)), axes)
 
 
-def test_a_time_line_is_in_the_order_of_time(axes):
-    report, taken = part_report(), source().taken
-    plot_time_line(report, "residuals", axes, taken=taken)
-    y = axes.lines[0].get_ydata()
-    np.testing.assert_allclose(y[np.isfinite(y)], report.images["rms_px"])
-    assert plot_time_line(report, "offsets", Figure().add_subplot(), taken=taken).get_legend() is not None
-    with pytest.raises(InputError, match="no quantity 'wind'; use one of offsets, residuals"):
-        plot_time_line(report, "wind")
-    bars = plot_photograph_residuals(report, Figure().add_subplot()).patches
-    np.testing.assert_allclose([bar.get_height() for bar in bars], report.images["rms_px"])
-
-
-def test_gaps_of_strips_before_and_after_have_the_same_colours(axes):
-    rng = np.random.default_rng(3)
-    before = Raster(rng.normal(0, 0.1, (20, 30)), 0.0, 20.0, 1.0)
-    after = Raster(before.heights / 5, 0.0, 20.0, 1.0)
-    assert plot_strip_differences(after, axes, limit_m=0.3) is axes and axes.images[0].get_clim() == (-30, 30)
-    np.testing.assert_allclose(axes.images[0].get_array(), 100 * after.heights)
-    whole = differences_figure(before, after).axes
-    assert whole[0].images[0].get_clim() == whole[1].images[0].get_clim()
-    assert whole[1].get_title(loc="left") == f"after: {axes.get_title(loc='left')}"
+def test_gaps_of_strips_are_drawn_in_centimetres(axes):
+    gaps = Raster(np.random.default_rng(3).normal(0, 0.1, (20, 30)), 0.0, 20.0, 1.0)
+    assert plot_strip_differences(gaps, axes, limit_m=0.3) is axes and axes.images[0].get_clim() == (-30, 30)
+    np.testing.assert_allclose(axes.images[0].get_array(), 100 * gaps.heights)
 
 
 def test_a_sensitivity_is_drawn_as_its_table_says(axes):

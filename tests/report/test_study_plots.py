@@ -17,10 +17,7 @@ from jaxphoto.report import (
     plot_models,
     plot_ray_offsets,
 )
-from jaxphoto.report.boresight import boresight_figure
-from jaxphoto.report.lidar import above_figure, heights_figure
-from jaxphoto.report.model_choice import choice_figure
-from jaxphoto.report.stability import change_headline, halves_figure
+from jaxphoto.report.stability import change_headline
 from jaxphoto.stability import change, image_grid
 from tests.report.studies import (
     GOPRO,
@@ -57,14 +54,13 @@ def test_misalignments_of_both_steps_and_shifts_of_strips(axes):
     np.testing.assert_allclose(shifts.collections[0].get_segments()[0][:, 0], [-0.1, 0.1])
     with pytest.raises(InputError, match="these steps estimated no shifts of strips"):
         plot_boresight(steps[2:], axes, shifts=True)
-    assert boresight_figure(steps[:1]) is None
 
 
 def test_maps_of_halves_have_the_values_of_their_cells(axes):
     halves = halves_found()
     levels = plot_halves(halves, axes).collections[0].levels
     assert (levels[0], levels[-1]) == pytest.approx((1.0, 2.0), abs=0.05)
-    band = halves_figure(halves).axes[1].collections[0].levels
+    band = plot_halves(halves, Figure().add_subplot(), band=True).collections[0].levels
     assert (band[0], band[-1]) == pytest.approx((0.1, 0.3), abs=0.02)
 
 
@@ -88,15 +84,11 @@ def test_models_are_drawn_by_bic_and_by_what_they_predict(axes):
     plot_models(choice, axes)
     bic = np.array([row[1] for row in MODELS.values()])
     np.testing.assert_allclose([bar.get_width() for bar in axes.patches], bic - bic.min())
-    assert {bar.get_x() for bar in axes.patches} == {1.0}
-    assert [text.get_text() for text in axes.get_xticklabels()][:3] == ["0", "2", "10"]
     rms = lines(plot_models(choice, Figure().add_subplot(), rms=True))
     np.testing.assert_allclose(rms["held out"].get_xdata(), [row[3] for row in MODELS.values()])
-    assert len(choice_figure(choice).axes) == 2
     assert set(lines(plot_models(model_choice_of(0), Figure().add_subplot(), rms=True))) == {"adjusted"}
     with pytest.raises(InputError, match="no model could be adjusted"):
         plot_models(choice._replace(judged=choice.judged[3:]), axes)
-    assert choice_figure(choice._replace(judged=choice.judged[3:])).axes == []
 
 
 def test_heights_of_a_cloud_are_counted_and_coloured(axes):
@@ -112,16 +104,15 @@ def test_heights_of_a_cloud_are_counted_and_coloured(axes):
     none = eqx.tree_at(lambda c: c.used, control, np.zeros_like(control.used))
     with pytest.raises(InputError, match="no height of the cloud is used as control"):
         plot_lidar_heights(none, axes, residuals=True)
-    assert [panel.has_data() for panel in heights_figure(none).axes] == [True, False]
 
 
 def test_points_above_a_cloud_have_the_colours_of_before(axes):
     result = simultaneous_of(0.5, 0.05)
     assert plot_above(result, axes) is axes and axes.get_title(loc="left") == "after: RMSE 0.050 m"
     np.testing.assert_allclose(axes.collections[0].get_array(), result.apart)
-    before, after = (panel.collections[0] for panel in above_figure(result).axes[:2])
+    before = plot_above(result, Figure().add_subplot(), before=True).collections[0]
     np.testing.assert_allclose(before.get_array(), result.apart_before)
-    assert before.get_clim() == after.get_clim() == axes.collections[0].get_clim() == (-0.5, 0.5)
+    assert before.get_clim() == axes.collections[0].get_clim() == (-0.5, 0.5)
 
 
 def test_offsets_of_rays_are_arrows_in_micrometres(axes):

@@ -9,8 +9,8 @@ import pytest
 
 from jaxphoto import Tables, adjust
 from jaxphoto.observations import CameraPositions
-from jaxphoto.report import verdict, verdict_of
-from tests.blocks import BROWN, CONTROL, Scene, Simulated, adjusted, aerial, all_stations, bare, free, measured, rows
+from jaxphoto.report import verdict_of
+from tests.blocks import BROWN, CONTROL, Scene, Simulated, aerial, all_stations, bare, free, measured, rows
 
 
 @functools.cache
@@ -25,21 +25,6 @@ def tables(relief: float, stations: bool | float, names=("c_mm", "xp_mm", "yp_mm
     observed = all_stations(built, 0.10 if stations is True else stations) if stations else CameraPositions.none()
     built = dataclasses.replace(built, control=rows(CONTROL), stations=observed)
     return Tables(adjust(measured(Simulated(free(built, "one", names), truth)).block))
-
-
-@pytest.mark.slow
-def test_a_target_field_has_its_own_remedies(monkeypatch):
-    monkeypatch.setattr(verdict, "HIGH_CORRELATION", 0.5)
-    monkeypatch.setattr(verdict, "HIGH_OWN_CORRELATION", 0.5)
-    # Any image feels it.
-    monkeypatch.setattr(verdict, "FELT", 0.0)
-    free_network = adjusted("inner_scale")
-    control = rows(range(len(free_network.block.points)), sigma=0.001)
-    control = dataclasses.replace(control, value=np.asarray(free_network.unknowns.points)[control.who, control.axis])
-    field = dataclasses.replace(free_network.block, control=control)
-    of_network, of_field = ("; ".join(verdict_of(Tables(a)).texts) for a in (free_network, adjust(field)))
-    assert "with stations (GNSS), relief" in of_network and "targets alone" not in of_network
-    assert "rotated by 90 degrees" in of_field and "targets alone" in of_field and "stations (GNSS)" not in of_field
 
 
 @pytest.mark.slow

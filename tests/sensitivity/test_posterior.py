@@ -12,7 +12,7 @@ import pytest
 from jaxphoto import FIXED, InputError, adjust, covariance
 from jaxphoto.camera import Brown, InteriorOrientation
 from jaxphoto.observations import ControlCoordinates
-from jaxphoto.report.draws import posterior_figure, posterior_table
+from jaxphoto.report.draws import posterior_table
 from jaxphoto.sensitivity.posterior import Posterior, posterior
 from tests.blocks import Scene, Simulated, adjusted, bare, free, measured
 
@@ -165,7 +165,7 @@ def test_fixed_coordinates_and_images_have_no_posterior():
             posterior(a, [name])
 
 
-def test_table_and_figure_show_both(of_cross):
+def test_the_table_shows_both(of_cross):
     table = posterior_table(of_cross)
     assert list(table["parameter"]) == [
         "interior[one].c_mm",
@@ -178,15 +178,3 @@ def test_table_and_figure_show_both(of_cross):
     assert table["laplace_sigma"][0] == pytest.approx(np.sqrt(of_cross.laplace[0, 0]))
     inside = (table["posterior_2.5_percent"] < table["optimum"]) & (table["optimum"] < table["posterior_97.5_percent"])
     assert inside.all()
-    figure = posterior_figure(of_cross)
-    assert len(figure.axes) == len(OF_CROSS) + 1
-    of_one = dataclasses.replace(
-        of_cross,
-        parameters=OF_CROSS[:1],
-        samples=of_cross.samples[:, :, :1],
-        optimum=of_cross.optimum[:1],
-        laplace=of_cross.laplace[:1, :1],
-        rhat=of_cross.rhat[:1],
-        ess=of_cross.ess[:1],
-    )
-    assert len(posterior_figure(of_one).axes) == 1

@@ -151,7 +151,6 @@ STRIP = {"name": "A", "heading_deg": 0.0, "images": 3}
         ({"points.min_images": 1}, "min_images: 1 is less than 2"),
         ({"points.mean_rays": 1.5}, "mean_rays: 1.5 is less than min_images = 2"),
         ({"targets.0.role": "contrl"}, r"\[targets, number 1\] role: 'contrl' is unknown; write .control"),
-        ({"targets.0.prefix": "T1"}, "prefix: 'T1' is not a unique prefix of targets"),
         ({"targets.0.at_m": [[1.0, "x"]]}, "at_m: 'x' is not a finite number"),
         ({"targets.0.choice": {"role": "check", "outer": 3}}, r"\[targets, number 1.choice\] outer: unknown key"),
         ({"targets.0.choice": {"role": "check", "centre": 1}}, "centre: 1 is neither true nor false"),

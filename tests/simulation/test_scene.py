@@ -201,8 +201,6 @@ def test_no_room_is_said():
         ({"terrain.houses": []}, r"\[terrain\] houses: unknown key"),
         ({"terrain.buildings": {"count": 3}}, r"is not a list; .* as \[\[terrain.buildings"),
         ({"terrain.buildings": [{"roof": "dome"}]}, "roof: 'dome' is unknown; write .flat"),
-        ({"terrain.buildings": [{"slope_deg": 30.0}]}, "a flat roof has no slope"),
-        ({"terrain.buildings": [{"roof": "gable", "slope_deg": 70.0}]}, "70 is steeper than 60 degrees"),
         ({"terrain.buildings": [{"length_m": [20.0, 10.0]}]}, "is not a range; give one number, or .minimum, max"),
         ({"terrain.buildings": [{"width_m": 0.0}]}, "width_m: 0.0 is not positive"),
         ({"terrain.trees": [{"crown_m": 2.0}]}, r"\[terrain.trees, number 1\] crown_m: unknown key"),

@@ -15,7 +15,6 @@ from jaxphoto.statistics.block_geometry import (
     format_coverage,
     image_links,
     intersection_angles,
-    weak_links,
 )
 from tests.blocks import adjusted
 
@@ -73,21 +72,6 @@ def test_links_are_the_points_that_two_images_share(block):
     common = {(i, j): n for i, j, n in zip(links.first, links.second, links.common, strict=True)}
     pairs = itertools.combinations(range(len(points)), 2)
     assert common == {(i, j): n for i, j in pairs if (n := len(points[i] & points[j]))}
-
-
-def test_no_other_pair_across_a_weak_link_is_stronger(block):
-    result, points = block
-    links, n = image_links(result), len(points)
-    weak = weak_links(result, links, n)
-    assert len(weak) == n - 1 and [w.common for w in weak] == sorted(w.common for w in weak)
-    for w in weak:
-        one = set(w.side.tolist())
-        other = set(range(n)) - one
-        assert len(one) <= len(other) and (w.first in one) != (w.second in one)
-        strongest = max(len(points[i] & points[j]) for i in one for j in other)
-        assert w.common == len(points[w.first] & points[w.second]) == strongest
-        assert w.across == len(set().union(*(points[k] for k in one)) & set().union(*(points[k] for k in other)))
-    assert weak_links(result, links, 2)[1].common == weak[1].common
 
 
 def test_angles_are_the_largest_between_two_rays(block):
