@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 EXTRAS = {
-    "laspy": "lidar", "lazrs": "lidar", "rasterio": "lidar",
-    "cv2": "photos", "pycolmap": "photos", "yaml": "photos",
+    "laspy": "lidar", "lazrs": "lidar",
+    "rasterio": "photos", "cv2": "photos", "pycolmap": "photos", "yaml": "photos",
     "pyarrow": "parquet",
     "plotly": "report", "xarray": "report",
     "blackjax": "posterior",

@@ -1,24 +1,15 @@
-"""Coverage of laser points by a trajectory; error messages with the likely cause of gaps."""
-
-from collections.abc import Sequence
+"""Coverage of laser points by a trajectory."""
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxphoto.cloud import Cloud
-from jaxphoto.errors import BlockError, InputError, few
+from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Trajectory
-from jaxphoto.georeferencing.time_scales import DAY, LAS_OFFSET, LEAP_SECONDS, looks_like, shift_that_fits
+from jaxphoto.georeferencing.time_scales import looks_like, shift_that_fits
 
 # Ratio of a record interval to the median interval above which it is a gap; one record may be missing.
 _GAP = 2.5
-# Minimum speed (m/s) for distinguishing a clock jump from lost records.
-_FLYING = 1.0
-# Number of records on each side of a gap for estimating the speed.
-_BESIDE = 20
-# Cosine of half the maximum turn (30 degrees) of the aircraft between records at a clock jump.
-_STRAIGHT = 0.966
-_START = "a start of their own"
 
 
 def longest_interval(trajectory: Trajectory) -> float:
@@ -26,185 +17,52 @@ def longest_interval(trajectory: Trajectory) -> float:
     return _GAP * float(np.median(np.diff(np.asarray(trajectory.time))))
 
 
-class CoveredTimes:
-    """Times of laser points per strip, accumulated in parts, relative to the contiguous pieces of a trajectory."""
+def covers(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """Return True for times (s) within the trajectory and outside its gaps."""
+    record = np.asarray(trajectory.time)
+    short = np.diff(record) <= longest_interval(trajectory)
+    # A record belongs to the intervals before and after it.
+    before, after = (
+        np.clip(np.searchsorted(record, time, side) - 1, 0, len(short) - 1)  # type: ignore[call-overload]
+        for side in ("left", "right")
+    )
+    return (time >= record[0]) & (time <= record[-1]) & (short[before] | short[after])
 
-    def __init__(self, trajectory: Trajectory) -> None:
-        time = np.asarray(trajectory.time)
-        self._trajectory = trajectory
-        self._gaps = np.flatnonzero(np.diff(time) > longest_interval(trajectory))
-        self._begins, self._ends = time[np.r_[0, self._gaps + 1]], time[np.r_[self._gaps, len(time) - 1]]
-        # First and last time by strip and interval index: 0 before the trajectory, odd within a piece, even in the
-        # following gap or after the end.
-        self._first: dict[str, np.ndarray] = {}
-        self._last: dict[str, np.ndarray] = {}
-        self._several: dict[str, bool] = {}
 
-    def covers(self, time: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
-        """Return True for times (s) within the trajectory and outside its gaps."""
-        return self._place(time) % 2 == 1
-
-    def add(self, part: Cloud) -> None:
-        """Add laser points; ignore points without times."""
-        if part.time is None or not len(part):
-            return
-        if part.strip is None:
-            self.add_times(part.time)
-            return
-        for k in np.flatnonzero(np.bincount(part.strip)):
-            self.add_times(part.time[part.strip == k], part.strips[k])
-
-    def add_times(self, time: Float[np.ndarray, "n"], strip: str = "") -> None:
-        """Add times (s) of the points of a strip, or of a cloud without strips."""
-        empty = np.full(2 * len(self._begins) + 1, np.inf)
-        first = self._first.setdefault(strip, empty)
-        last = self._last.setdefault(strip, -empty)
-        self._several[strip] = len(time) > 1 or self._several.get(strip, False)
-        ends = np.array([time.min(), time.max()])
-        place = self._place(ends)
-        if place[0] != place[1]:
-            # Examine every time only in this case.
-            ends, place = time, self._place(time)
-        np.minimum.at(first, place, ends)
-        np.maximum.at(last, place, ends)
-
-    def check(self, shift_s: float = 0.0) -> None:
-        """Raise InputError or BlockError if cloud and trajectory do not match.
-
-        `shift_s` has been subtracted from the given times of the trajectory.
-        """
-        error = self._of_one_time() or self.uncovered(shift_s) or self._of_two_lines()
-        if error is not None:
-            raise error
-
-    def uncovered(self, shift_s: float = 0.0) -> BlockError | None:
-        """Return an error if points lie before, after or in a gap of the trajectory; otherwise None."""
-        return self._outside(shift_s) or self._in_a_gap()
-
-    def _place(self, time: Float[np.ndarray, "n"]) -> Int[np.ndarray, "n"]:
-        piece = np.searchsorted(self._begins, time, side="right")
-        # An isolated record between two gaps does not cover its time.
-        within = (time <= self._ends[piece - 1]) & (self._begins[piece - 1] < self._ends[piece - 1])
-        return 2 * piece - ((piece > 0) & within)
-
-    def _of_one_time(self) -> InputError | None:
-        one = [s for s, first in self._first.items() if self._several[s] and first.min() == self._last[s].max()]
-        if not one:
-            return None
-        every = len({float(first.min()) for first in self._first.values()}) == 1 and len(one) == len(self._first)
-        of = "" if every else f" of strip {one[0]}"
-        return InputError(
-            f"all laser points{of} have one time, {self._first[one[0]].min():.3f} s, so their positions on the "
-            "trajectory are unknown: use a cloud with the GPS time of each point, or omit the trajectory"
-        )
-
-    def _outside(self, shift_s: float) -> BlockError | None:
-        start, end = float(self._begins[0]), float(self._ends[-1])
-        spans = {s: (float(first.min()), float(self._last[s].max())) for s, first in self._first.items()}
-        outside = [s for s, (first, last) in spans.items() if not (first >= start and last <= end)]
-        if not outside:
-            return None
-        first, last = min(first for first, _ in spans.values()), max(last for _, last in spans.values())
-        shift = shift_that_fits(np.array([first, last]), start + shift_s, end + shift_s)
-        option, leap = f"--trajectory-shift-s {shift or 0.0:.15g}", LEAP_SECONDS[0]
-        if last < start or first > end or (shift is not None and abs(shift - shift_s) > leap):
-            advice = "give the trajectory of this flight, or the difference of the clocks (--trajectory-shift-s)"
-            if start + shift_s <= first and last <= end + shift_s:
-                advice = "omit --trajectory-shift-s: without it the trajectory covers all points"
-            elif shift is not None:
-                advice = f"give {option}: the trajectory then covers all points"
-                if shift % DAY in (0.0, LAS_OFFSET % DAY, -LAS_OFFSET % DAY):
-                    advice += f" ({leap} s more if the cloud's clock is UTC, {leap} s less if the trajectory's is)"
-            cloud, trajectory = np.array([first, last]), np.array([start, end]) + shift_s
-            return BlockError(
-                f"{self._measured(outside)}: the cloud's clock shows {looks_like(cloud, _START)}, the trajectory's "
-                f"{looks_like(trajectory, _START)}; {advice}"
+def check_covered(cloud: Cloud, trajectory: Trajectory) -> None:
+    """Raise InputError or BlockError for laser points where `trajectory` has no records, or that have all one time."""
+    if cloud.time is None:
+        return
+    strip = np.zeros(len(cloud), int) if cloud.strip is None else cloud.strip
+    for k in np.unique(strip):
+        time, name = cloud.time[strip == k], f" of strip {cloud.strips[k]}" if len(cloud.strips) > 1 else ""
+        if len(time) > 1 and time.min() == time.max():
+            raise InputError(
+                f"all laser points{name} have one time, {time[0]:.3f} s, so their positions on the trajectory are "
+                "unknown: use a cloud with the GPS time of each point, or omit the trajectory"
             )
-        gaps = [f"begins {start - first:.3f} s later"] if first < start else []
-        gaps += [f"ends {last - end:.3f} s earlier"] if last > end else []
-        advice = "give the trajectory of the whole flight, or the cloud without these points"
-        if shift is not None:
-            advice += f", or, if one clock is UTC and the other GPS time, {option}"
-        return BlockError(
-            f"{self._measured(outside)}: the cloud goes from {first:.3f} to {last:.3f} s, the trajectory from "
-            f"{start:.3f} to {end:.3f} s ({' and '.join(gaps)}); {advice}"
-        )
-
-    def _in_a_gap(self) -> BlockError | None:
-        for k, record in enumerate(self._gaps):
-            inside = [s for s, first in self._first.items() if np.isfinite(first[2 * k + 2])]
-            if not inside:
-                continue
-            begin, end = float(self._ends[k]), float(self._begins[k + 1])
-            gap = (
-                f"{self._measured(inside)}: it has a gap of {end - begin:.3f} s, from {begin:.3f} to {end:.3f} s of "
-                "the cloud's clock"
+        if not covers(trajectory, time).all():
+            raise not_covered(trajectory, time, name)
+        # A strip with records missing in its middle consists of two flight lines.
+        inside = np.asarray(trajectory.time)
+        gap = np.flatnonzero(np.diff(inside) > longest_interval(trajectory))
+        split = gap[(inside[gap] > time.min()) & (inside[gap + 1] < time.max())]
+        for at in inside[split[:1]]:
+            raise BlockError(
+                f"laser points{name} lie before and after a gap of the trajectory at {at:.3f} s, as for two flight "
+                "lines with one point source ID: give each line its own ID, or use a trajectory without the gap"
             )
-            jump = self._jump(int(record))
-            if jump is None:
-                return BlockError(
-                    f"{gap}; give the trajectory with the records of this time, or the cloud without the points "
-                    "measured then"
-                )
-            return BlockError(
-                f"{gap}, but the scanner moves only as far as between two records: the trajectory's clock jumps. "
-                f"Subtract {jump:.3f} s from its times after the gap, or re-export it"
-            )
-        return None
-
-    def _measured(self, strips: Sequence[str]) -> str:
-        of = "" if len(strips) == len(self._first) > 1 else _strips(strips)
-        return f"laser points{of and f' of {of}'} were measured where the trajectory has no records"
-
-    def _jump(self, record: int) -> float | None:
-        """Return the clock jump (s) in the gap after a record; None if records were lost."""
-        time, position = np.asarray(self._trajectory.time), np.asarray(self._trajectory.position)
-        before, after = np.asarray(self._trajectory.quaternion)[record : record + 2]
-        if abs(before @ after) < _STRAIGHT:
-            # The aircraft has turned, and is back at the end of the last strip.
-            return None
-        near = slice(max(record - _BESIDE, 0), record + _BESIDE + 2)
-        lasts = np.diff(time[near])
-        moves = np.linalg.norm(np.diff(position[near], axis=0), axis=1)
-        usual = lasts <= longest_interval(self._trajectory)
-        if not usual.any():
-            return None
-        speed = float(np.median(moves[usual] / lasts[usual]))
-        index = record - near.start
-        needed = moves[index] / speed if speed > _FLYING else np.inf
-        return lasts[index] - needed if needed < longest_interval(self._trajectory) else None
-
-    def _of_two_lines(self) -> BlockError | None:
-        for strip, first in self._first.items():
-            there = 2 * np.flatnonzero(np.isfinite(first[1::2])) + 1
-            if len(there) > 1:
-                last, (a, b) = self._last[strip], there[:2]
-                return BlockError(
-                    f"{_strips([strip]) or 'the cloud'} has laser points from {first[a]:.3f} to {last[a]:.3f} s and "
-                    f"from {first[b]:.3f} to {last[b]:.3f} s, and the trajectory has a gap between, as for two flight "
-                    "lines with one point source ID: give each line its own ID, or use a trajectory without the gap"
-                )
-        return None
 
 
-def check_covered(cloud: Cloud, trajectory: Trajectory, shift_s: float = 0.0) -> None:
-    """Apply `CoveredTimes.check` to a whole cloud."""
-    coverage = CoveredTimes(trajectory)
-    coverage.add(cloud)
-    coverage.check(shift_s)
-
-
-def not_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> BlockError:
+def not_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"], of: str = "") -> BlockError:
     """Return the error for times (s) of laser points outside the trajectory."""
-    coverage = CoveredTimes(trajectory)
-    coverage.add_times(time)
-    error = coverage.uncovered()
-    assert error is not None
-    return error
-
-
-def _strips(names: Sequence[str]) -> str:
-    """Return the names of strips as text; empty for a cloud without strips."""
-    if not any(names):
-        return ""
-    return f"strip {names[0]}" if len(names) == 1 else f"strips {few(names)}"
+    record = np.asarray(trajectory.time)
+    shift = shift_that_fits(time, record[0], record[-1])
+    cure = f", or shift its clock (--trajectory-shift-s {shift:+.15g})" if shift is not None else ""
+    first = time[~covers(trajectory, time)].min()
+    clocks = (looks_like(times, "a start of its own") for times in (time, record))
+    return BlockError(
+        f"laser points{of} were measured where the trajectory has no records, first at {first:.3f} s: the cloud's "
+        f"clock shows {next(clocks)}, the trajectory's {next(clocks)}; "
+        f"give the trajectory of the whole flight, or the cloud without these points{cure}"
+    )

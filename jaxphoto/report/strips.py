@@ -14,7 +14,7 @@ from rich.console import Console
 
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import TrajectoryKnot
-from jaxphoto.lidar.raster import Raster
+from jaxphoto.lidar.strip_planes import Raster
 from jaxphoto.observations import AttitudeSteps, PositionSteps
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_adjustment import PHOTOGRAPHS
@@ -75,6 +75,16 @@ def all_correlations(result: StripAdjustment) -> pd.DataFrame:
     labels = list(result.adjusted.structure.labels)
     rho = correlation_matrix(result.covariance)[-len(labels) :, -len(labels) :]
     return pd.DataFrame(rho, columns=labels).set_index(pd.Index(labels, name="parameter"))
+
+
+def gaps_table(before: Raster, after: Raster) -> pd.DataFrame:
+    """Tabulate gaps of strips by cell: X_m and Y_m of its centre, before_m and after_m (m)."""
+    parts = []
+    for name, raster in (("before_m", before), ("after_m", after)):
+        row, column = np.nonzero(np.isfinite(raster.heights))
+        x, y = raster.west + (column + 0.5) * raster.cell_m, raster.north - (row + 0.5) * raster.cell_m
+        parts.append(pd.DataFrame({"X_m": x.round(3), "Y_m": y.round(3), name: raster.heights[row, column]}))
+    return parts[0].merge(parts[1], "outer")
 
 
 def calibration_table(result: StripAdjustment) -> pd.DataFrame:
@@ -361,15 +371,16 @@ def write_strips(
     result: StripAdjustment,
     tables: Tables | None,
     verdict: Verdict,
+    gaps: tuple[Raster | None, Raster | None],
     directory: Path,
-    write_corrected: Callable[[Path], tuple[Raster, Raster] | None],
+    write_corrected: Callable[[Path], None],
     record: CommandRecord,
 ) -> None:
     """Write tables, differences.png, report.html, summary.json; with images also the folder `adjustment`.
 
-    `tables` contains the adjustment if it has images. `write_corrected` writes cloud and trajectory into the folder and
-    returns the gaps of the strips before and after. Raises InputError if `directory` contains anything but an earlier
-    result.
+    `tables` contains the adjustment if it has images, `gaps` the `strip_differences` before and after.
+    `write_corrected` writes cloud and trajectory into the folder. Raises InputError if `directory` contains anything
+    but an earlier result.
     """
     began, seconds = time.perf_counter(), dict(result.adjusted.seconds)
     files = {
@@ -381,8 +392,12 @@ def write_strips(
         if tables is not None:
             write_results(tables, verdict, work / "adjustment", seconds, record=record)
         all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
-        gaps = write_corrected(work)
-        figures = {} if gaps is None else {"differences": differences_figure(*gaps)}
+        write_corrected(work)
+        before, after = gaps
+        figures = {}
+        if before is not None and after is not None:
+            figures["differences"] = differences_figure(before, after)
+            files["differences"] = gaps_table(before, after)
         n = len(result.cloud.strips)
         name = f"{n} strip{'s' * (n > 1)}{' and photographs' if result.before else ''}: strip adjustment"
         summary = verdict.summary | {

@@ -8,7 +8,6 @@ from it.
 """
 
 import dataclasses
-import warnings
 from collections.abc import Callable, Collection
 from typing import Any, NamedTuple, get_args
 
@@ -48,7 +47,7 @@ from jaxphoto.procedures.lidar.iterate_to_convergence import (
     iterate_to_convergence,
     with_common_error,
 )
-from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
+from jaxphoto.procedures.lidar.strip_model import check_measured_from
 from jaxphoto.procedures.lidar.vertical_control import no_surface_error, tie_points
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import Covariance
@@ -142,8 +141,8 @@ def simultaneous(
     which = tie_points(block, points)
     first = adjust_with_fixed_interior(block)
     path = scanner_path(trajectory) if timed else None  # type: ignore[arg-type]
-    for sentence in [] if path is None else check_measured_from(cloud, path):
-        warnings.warn(sentence, UserWarning, stacklevel=2)
+    if path is not None:
+        check_measured_from(cloud, path)
     strips = _strips(cloud, names, path)
     none: Scanner = jax.tree.map(np.asarray, Scanner(jnp.zeros(3), dict.fromkeys(names, jnp.zeros(3))))
     strip = np.repeat(np.arange(len(names)), len(which))

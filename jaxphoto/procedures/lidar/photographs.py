@@ -12,7 +12,7 @@ from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import StripSpline, Trajectory
 from jaxphoto.georeferencing.time_scales import looks_like, shift_that_fits
 from jaxphoto.lidar.correction import scanner_path, scanner_poses
-from jaxphoto.lidar.coverage import CoveredTimes
+from jaxphoto.lidar.coverage import covers
 from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import Attitudes, CameraPositions, StripPlanes, TrajectoryAttitudes, TrajectoryStations
 from jaxphoto.procedures.lidar.iterate_to_convergence import check_without_surfaces
@@ -70,7 +70,7 @@ def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -
             f"records: the exposures are at {looks_like(time)}, the trajectory at {looks_like(times)}; give the "
             f"trajectory of the whole flight, or the exposures {on_its_clock}"
         )
-    for k in np.flatnonzero(~CoveredTimes(trajectory).covers(time)):
+    for k in np.flatnonzero(~covers(trajectory, time)):
         before, after = times[times <= time[k]][-1], times[times >= time[k]][0]
         raise BlockError(
             f"image {block.images[k]} was exposed at {time[k]:.3f} s, in a gap of the trajectory from {before:.3f} to "

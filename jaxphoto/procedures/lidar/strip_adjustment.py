@@ -27,7 +27,6 @@ from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.lidar.iterate_to_convergence import CHANGE_LIMIT, adjust_with_fixed_interior, at_result
 from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
 from jaxphoto.procedures.lidar.plane_search import CommonPlanes, PointPlanes, PointSearch, StripSearch, check_joined
-from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 from jaxphoto.procedures.lidar.strip_control import (
     CHECK,
     CONTROL,
@@ -39,7 +38,14 @@ from jaxphoto.procedures.lidar.strip_control import (
     with_control,
     with_datum,
 )
-from jaxphoto.procedures.lidar.strip_model import ScannerPriors, errors_of, knot_sigmas, step_rows, strip_block
+from jaxphoto.procedures.lidar.strip_model import (
+    ScannerPriors,
+    check_measured_from,
+    errors_of,
+    knot_sigmas,
+    step_rows,
+    strip_block,
+)
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.statistics import Covariance, covariance
 from jaxphoto.unknowns import FIXED
@@ -164,7 +170,8 @@ def adjust_strips(
     names = _check(cloud, trajectory, fixed, photographs is None and priors.right, control is not None)
     path = None if trajectory is None else scanner_path(trajectory)
     pattern = priors.calibration.pattern
-    messages = [] if path is None else check_measured_from(cloud, path, None if priors.right else pattern)
+    if path is not None:
+        check_measured_from(cloud, path, None if priors.right else pattern)
     spans, images = _spans(cloud), None
     if photographs is not None:
         check_photographs(photographs, trajectory)
@@ -239,7 +246,7 @@ def adjust_strips(
                 + _point_differences(CHECK, first_on_surveyed.check, on_surveyed.check),
                 tuple(rounds),
                 converged,
-                (*messages, *(() if ties is None else ties.unseen(on_ties, adjusted.block.points))),
+                () if ties is None else tuple(ties.unseen(on_ties, adjusted.block.points)),
                 () if control is None else surveyed_gaps(control, on_surveyed, errors, path, adjusted, cov),
             )
         # Free gigabytes for large flights before the next iteration.

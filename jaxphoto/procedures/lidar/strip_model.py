@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.block import Block, empty_block
 from jaxphoto.cloud import Cloud
+from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import (
     Pattern,
     Scanner,
@@ -67,6 +68,58 @@ def aside(cloud: Cloud, which: Int[np.ndarray, "n"], path: ScannerPath) -> Float
         shot = np.einsum("nji,nj->ni", poses.object_from_body, cloud.xyz[portion] - poses.position)
         parts.append(shot[:, :2] / np.maximum(-shot[:, 2:], 1e-9))
     return np.concatenate(parts)
+
+
+def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None = None) -> None:
+    """Raise BlockError if the points of `cloud` cannot have been measured from this trajectory, or by this pattern.
+
+    In the body frame, a scanner's points are in the same region along the whole flight. If the trajectory is in another
+    system, in feet, on another clock or has another yaw, they are not, and an adjustment is meaningless.
+    """
+    some = np.linspace(0, len(cloud) - 1, min(_PROBED, len(cloud))).astype(int)
+    time = cloud.time[some]  # type: ignore[index]
+    away = float(np.median(np.linalg.norm(cloud.xyz[some] - scanner_poses(path, time).position, axis=1)))
+    cure = "bring cloud and trajectory into one coordinate system, in metres, and onto one clock, angles in degrees"
+    if away > _FARTHEST_M:
+        raise BlockError(f"the laser points are {away / 1000:.0f} km from the scanner's trajectory: {cure}")
+    second = np.floor(time - time.min()).astype(np.int64)
+    order = np.argsort(second, kind="stable")
+    _, first, number = np.unique(second[order], return_index=True, return_counts=True)
+    tangents = aside(cloud, some, path)
+    parts = [tangents[order[k : k + n]] for k, n in zip(first, number, strict=True) if n >= _FEWEST_A_SECOND]
+    if not parts:
+        return
+    # Use the first and last decile: a return above the scanner may be arbitrarily far across.
+    low, middle, high = np.stack([np.quantile(part, (0.1, 0.5, 0.9), axis=0) for part in parts], axis=1)
+    right, ahead = np.median((high - low) / 2, axis=0)
+    half = max(right, ahead)
+    if half < _NARROW:
+        return
+    moves = np.subtract(*np.quantile(middle, (0.9, 0.1), axis=0)) / 2
+    if max(moves) > _WANDERS * half or np.abs(np.median(middle, axis=0)).max() > _ASIDE:
+        raise BlockError(
+            f"laser points of one second scatter about the scanner, up to {np.abs(middle).max():.1f} flying heights to "
+            f"one side, but the swath is {2 * half:.2f} flying heights wide: {cure}"
+        )
+    spread = f"laser points of one second spread to the side by {right:.2f} of the height and ahead by {ahead:.2f}"
+    if pattern is not None and right < _ALIKE * ahead:
+        raise BlockError(
+            f"{spread}: the scan is not across the x axis. Correct the trajectory's yaw, or rotate it to the scanner "
+            "axes"
+        )
+    scanned: Pattern = "circle" if ahead > _ALIKE * right else "line"
+    if pattern is not None and scanned != pattern:
+        raise BlockError(f"{spread}, as for a {scanned} scan: give its pattern (--pattern {scanned})")
+
+
+# Maximum range of an airborne laser scanner (m); number of points examined; minimum number of points per second.
+_FARTHEST_M, _PROBED, _FEWEST_A_SECOND = 10_000.0, 50_000, 20
+# Maximum drift of the one-second median, in half swath widths (allows gaps over water); maximum of its median over the
+# flight, as a tangent.
+_WANDERS, _ASIDE = 1.5, 3.0
+# Ratio of the spreads ahead and across above which the pattern is circular, below which it consists of lines; minimum
+# half swath width, relative to the height, for this test.
+_ALIKE, _NARROW = 0.5, 0.02
 
 
 _ZERO = np.zeros(3)
