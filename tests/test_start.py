@@ -9,16 +9,14 @@ import sys
 from typing import get_args
 
 import pytest
+from jaxphoto.io.clouds import Returns
 from typer.main import get_command
 
 from jaxphoto.camera.undistortion import Keep
 from jaxphoto.extras.formats import CAMERAS_WRITTEN, LOSS_PX
 from jaxphoto.extras.photos.features import LONGEST_PX
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
-from jaxphoto.io.clouds.cloud_reader import Returns
-from jaxphoto.io.clouds.coordinate_system import UNITS
 from jaxphoto.io.shipped import EXAMPLES
-from jaxphoto.lidar.raster import Statistic
 from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.losses import LOSSES
 from jaxphoto.parameters import dynamic_fields
@@ -50,10 +48,8 @@ CHOICES = [
     (photographs.undistort, "keep", get_args(Keep)),
     (lidar.lidar_control, "method", METHODS),
     (lidar.lidar_control, "returns", get_args(Returns)),
-    (lidar.lidar_control, "cloud_unit", UNITS),
     (lidar.simultaneous, "method", SURFACES),
     (lidar.strips, "pattern", PATTERN_OF),
-    (lidar.dsm, "statistic", get_args(Statistic)),
 ]
 DEFAULTS = [
     (blocks.sensitivity, "delta0", DELTA0),

@@ -37,16 +37,15 @@ REFUSED = HeightFlag.HOLE | HeightFlag.EDGE | HeightFlag.VEGETATION | HeightFlag
 class HeightSettings(eqx.Module):
     """Settings of height interpolation, and errors of the lidar.
 
-    `points`: number of nearest points for `idw` and `plane`; with `radius_m` they use all points within it instead.
-    `local` uses three times `points`, at least 24. `power`: exponent of `idw`. `sigma_z_m`, `sigma_xy_m`: standard
-    deviations of a laser point in Z and in each of X and Y; `sigma_systematic_m`: common error of all points. A
-    position is flagged if at least the fraction `leafy_share` of the points used is vegetation or multiple returns;
-    heights with a flag of `refuse` are NaN.
+    `points`: number of nearest points for `plane` and pseudo control; `local` uses three times `points`, at least 24.
+    `power`: exponent of the weights of pseudo control. `sigma_z_m`, `sigma_xy_m`: standard deviations of a laser point
+    in Z and in each of X and Y; `sigma_systematic_m`: common error of all points. A position is flagged if at least the
+    fraction `leafy_share` of the points used is vegetation or multiple returns; heights with a flag of `refuse` are
+    NaN.
     """
 
     points: int = 8
     power: float = 2.0
-    radius_m: float | None = None
     sigma_z_m: float = 0.15
     sigma_xy_m: float = 0.5
     sigma_systematic_m: float = 0.0
@@ -56,9 +55,9 @@ class HeightSettings(eqx.Module):
     def __check_init__(self) -> None:
         if self.points < 4:
             raise InputError(f"points is {self.points}; heights need 4 or more")
-        for name in ("power", "sigma_z_m", "radius_m"):
+        for name in ("power", "sigma_z_m"):
             value = getattr(self, name)
-            if value is not None and not (np.isfinite(value) and value > 0):
+            if not (np.isfinite(value) and value > 0):
                 raise InputError(f"{name} is {value}: give a positive number")
         for name in ("sigma_xy_m", "sigma_systematic_m", "leafy_share"):
             if not (np.isfinite(getattr(self, name)) and getattr(self, name) >= 0):
@@ -190,90 +189,6 @@ def inverse_distance_weights(
     some = used & (ratio > 0)
     weight = jnp.where(some, jnp.where(some, ratio, 1.0) ** (power / 2), 0.0)
     return weight / jnp.maximum(jnp.sum(weight), 1e-300)
-
-
-# Delaunay triangle that contains one position, from the surrounding points only.
-#
-# Lift every point q to |q|^2: the triangulation is the lower hull of the lifted points (Edelsbrunner and Seidel 1986),
-# and the triangle that contains the position, taken as origin, is the facet that intersects a vertical line there. It
-# is the solution of
-#
-#     maximise b    subject to    a . q_i + b <= |q_i|^2    for all i
-#
-# in a (2) and b, by a dual simplex method: start with a triangle that contains the position; while a point lies in its
-# circumcircle, insert the point deepest below the facet in place of the corner whose removal leaves the position
-# inside. Three artificial distant points form the initial triangle; if one of them remains, the position is outside all
-# others. The triangle belongs to the triangulation of the whole cloud if its circumcircle lies in the circle within
-# which all points are given.
-
-_MOST_STEPS = 100
-# Vertices of the initial triangle (unit: distance of the farthest point) and their lifted coordinate, large enough that
-# their facets are vertical.
-_FAR = 4 * np.stack([np.cos([0.5, 2.6, 4.7]), np.sin([0.5, 2.6, 4.7])], axis=1)
-_LIFT = 1e7
-# Ratio of a depth to the largest lifted corner below which it is a rounding error.
-_ROUNDING = 1e-14
-
-
-class Triangle(NamedTuple):
-    """Barycentric weights of the points: nonzero for the three corners only."""
-
-    weight: Float[Array, "points"]
-    inside: Bool[Array, ""]
-    """True if a triangle contains the position."""
-    safe: Bool[Array, ""]
-    """True if no point outside the given neighbours can lie in its circumcircle."""
-
-
-def delaunay_triangle(near: Neighbours) -> Triangle:
-    """Find the triangle of the neighbours that contains the position."""
-    unit = jnp.max(jnp.where(near.there, near.distance, 0.0))
-    unit = jnp.where(unit > 0, unit, 1.0)
-    points = jnp.concatenate([jnp.where(near.there[:, None], near.xy / unit, 0.0), _FAR])
-    n = len(near.z)
-    lifted = jnp.concatenate([jnp.where(near.there, jnp.sum(points[:n] ** 2, axis=1), 2 * _LIFT), jnp.full(3, _LIFT)])
-
-    def deepest(corners):
-        """Return the point deepest under the facet, and True if the depth exceeds rounding."""
-        at, height = points[corners], lifted[corners]
-        slope = _slope(at, height)
-        above = lifted - height[0] - (points - at[0]) @ slope
-        above = above.at[corners].set(0.0)
-        k = jnp.argmin(above)
-        return k, above[k] < -_ROUNDING * jnp.max(height)
-
-    def step(state):
-        corners, k, _, steps = state
-        share, of_new = _barycentric(points[corners], jnp.zeros(2)), _barycentric(points[corners], points[k])
-        ratio = jnp.where(of_new > 0, jnp.maximum(share, 0.0) / jnp.where(of_new > 0, of_new, 1.0), jnp.inf)
-        corners = corners.at[jnp.argmin(ratio)].set(k)
-        return corners, *deepest(corners), steps + 1
-
-    first = jnp.arange(n, n + 3)
-    state = (first, *deepest(first), 0)
-    corners, _, wrong, _ = jax.lax.while_loop(lambda s: s[2] & (s[3] < _MOST_STEPS), step, state)
-    inside = jnp.all(corners < n) & ~wrong
-    weight = jnp.zeros(n + 3).at[corners].add(_barycentric(points[corners], jnp.zeros(2)))[:n]
-    at = points[corners] - points[corners[0]]
-    # The gradient of the lifted facet is twice the circumcentre: grad |c|^2 = 2 c.
-    centre = _slope(at, jnp.sum(at**2, axis=1)) / 2
-    farthest = jnp.linalg.norm(centre + points[corners[0]]) + jnp.linalg.norm(centre)
-    return Triangle(jnp.where(inside, weight, 0.0), inside, inside & (farthest < 1 - 1e-9))
-
-
-def _slope(at: Float[Array, "3 2"], height: Float[Array, "3"]) -> Float[Array, "2"]:
-    """Return the gradient of the plane over three points."""
-    (ax, ay), (bx, by) = at[1] - at[0], at[2] - at[0]
-    a, b = height[1] - height[0], height[2] - height[0]
-    return jnp.stack([a * by - b * ay, b * ax - a * bx]) / (ax * by - bx * ay)
-
-
-def _barycentric(at: Float[Array, "3 2"], place: Float[Array, "2"]) -> Float[Array, "3"]:
-    """Return barycentric coordinates of a position; their sum is 1."""
-    (ax, ay), (bx, by), (px, py) = at[1] - at[0], at[2] - at[0], place - at[0]
-    double = ax * by - bx * ay
-    second, third = (px * by - bx * py) / double, (ax * py - px * ay) / double
-    return jnp.stack([1 - second - third, second, third])
 
 
 _DIRECTIONS = np.pi * np.arange(12) / 12
@@ -425,16 +340,6 @@ _ROUGH = 3.0
 _WIDTH = 0.5
 
 
-class HeightNumbers(NamedTuple):
-    """Numerical settings, passed as arrays: changes need no recompilation."""
-
-    points: Int[ArrayLike, ""]
-    power: Float[ArrayLike, ""]
-    radius: Float[ArrayLike, ""]
-    """Search radius (m); zero: use the nearest points."""
-    noise: LidarNoise
-
-
 class HeightEstimate(NamedTuple):
     """Estimate at one position."""
 
@@ -459,26 +364,24 @@ class HeightEstimate(NamedTuple):
     """Number of points used for the surface."""
     one_surface: Float[ArrayLike, ""]
     """Residual variance (m^2) of one smooth surface."""
-    final: Bool[ArrayLike, ""]
-    """True if more points would not change the result."""
 
 
 @eqx.filter_jit
 def estimate_heights(
-    near: Neighbours, leafy: Bool[Array, "places points"], numbers: HeightNumbers, method: str
+    near: Neighbours, leafy: Bool[Array, "places points"], points: Int[ArrayLike, ""], noise: LidarNoise, method: str
 ) -> HeightEstimate:
     """Estimate the height at every position by `method`; arrays of `near` have a leading axis over the positions."""
-    return jax.vmap(lambda n, of: _estimate(n, of, numbers, method))(near, leafy)
+    return jax.vmap(lambda n, of: _estimate(n, of, points, noise, method))(near, leafy)
 
 
-def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNumbers, method: str) -> HeightEstimate:
-    in_radius = near.there & (near.distance <= numbers.radius)
-    n_used = jnp.where(numbers.radius > 0, jnp.sum(in_radius), numbers.points)
-    n_around = jnp.maximum(WIDE, TIMES * n_used)
+def _estimate(
+    near: Neighbours, leafy: Bool[Array, "points"], points: Int[ArrayLike, ""], noise: LidarNoise, method: str
+) -> HeightEstimate:
+    n_around = jnp.maximum(WIDE, TIMES * points)
     # Points closer than their horizontal errors do not determine curvature.
-    n_wide = jnp.maximum(n_around, jnp.sum(near.there & (near.distance <= APART * numbers.noise.sigma_xy)))
+    n_wide = jnp.maximum(n_around, jnp.sum(near.there & (near.distance <= APART * noise.sigma_xy)))
     rank = jnp.arange(len(near.z))
-    used, around = near.there & (rank < n_used), near.there & (rank < n_around)
+    used, around = near.there & (rank < points), near.there & (rank < n_around)
     wide, narrow = near.there & (rank < n_wide), near.there & (rank < n_wide // 2)
     curved, flat = (
         fit_surface(near, wide.astype(float), quadratic=True),
@@ -486,22 +389,15 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
     )
 
     def misfit(fit: LocalFit, quantile: float) -> Bool[Array, ""]:
-        return excess(fit, noise_variance(fit, numbers.noise), quantile) > 1
+        return excess(fit, noise_variance(fit, noise), quantile) > 1
 
     # Prefer a local plane near a breakline: points beyond it are irrelevant.
     take_flat = ~curved.interpolates | (misfit(curved, _HARDLY) & flat.interpolates & ~misfit(flat, _SELDOM))
     fit = jax.tree.map(lambda a, b: jnp.where(take_flat, a, b), flat, curved)
-    final = interpolates = jnp.array(True)
-    if method == "idw":
-        weight = inverse_distance_weights(near.distance**2, used, numbers.power)
-        weight = jnp.where(jnp.any(used), weight, jnp.nan)
-    elif method == "plane":
+    interpolates = jnp.array(True)
+    if method == "plane":
         plane = fit_surface(near, used.astype(float), quadratic=False)
         weight, interpolates = jnp.where(plane.determined, plane.rows[0], jnp.nan), plane.interpolates
-    elif method == "tin":
-        triangle = delaunay_triangle(near)
-        weight, final = jnp.where(triangle.inside, triangle.weight, jnp.nan), triangle.safe
-        used = triangle.weight != 0
     else:
         used = around & (~take_flat | (rank < n_around // 2))
         reach = jnp.max(jnp.where(used, near.distance, 0.0))
@@ -509,13 +405,13 @@ def _estimate(near: Neighbours, leafy: Bool[Array, "points"], numbers: HeightNum
         curved, flat = fit_surface(near, bell, quadratic=True), fit_surface(near, bell, quadratic=False)
         weight = jnp.where(take_flat, flat.rows[0], curved.rows[0])
     reach, n_there = jnp.max(jnp.where(around, near.distance, 0.0)), jnp.sum(around)
-    expected = noise_variance(fit, numbers.noise)
+    expected = noise_variance(fit, noise)
     return HeightEstimate(
         height=jnp.sum(weight * jnp.where(near.there, near.z, 0.0)),
-        sigma=height_sigma(near, weight, fit, numbers.noise), used=jnp.sum(used),
+        sigma=height_sigma(near, weight, fit, noise), used=jnp.sum(used),
         density=(n_there - 1) / (jnp.pi * reach**2), roughness=jnp.sqrt(fit.variance), gradient=fit.coefficients[1:3],
         leafy=jnp.sum(leafy & used) / jnp.maximum(jnp.sum(used), 1), hole=empty_about(near.distance, around),
         surrounded=surrounded(near.xy, around) & fit.interpolates & interpolates, plane=take_flat & (method == "local"),
         misfit=misfit(fit, _HARDLY), rough=fit.variance > _ROUGH**2 * expected, wide=jnp.sum(wide),
-        one_surface=curved.variance, final=final,
+        one_surface=curved.variance,
     )  # fmt: skip

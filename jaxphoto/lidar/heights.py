@@ -1,10 +1,8 @@
 """Heights at X, Y from a cloud, with standard deviations; refused where the cloud does not determine them.
 
-Four interpolations of the heights of surrounding points, H = sum w_i Z_i:
+Two interpolations of the heights of surrounding points, H = sum w_i Z_i:
 
-- `idw`: w ~ distance^-power over the nearest points (only the point at the position, if there is one),
 - `plane`: least squares through the nearest points,
-- `tin`: linear in the triangle of the Delaunay triangulation of the whole cloud (`tin`),
 - `local`: moving least squares, a quadratic with Gaussian weights; a plane if the points do not determine a quadratic.
 
 Error model: `height_estimate`; files and figures: docs/lidar_heights.md.
@@ -27,7 +25,6 @@ from jaxphoto.lidar.height_estimate import (
     WIDE,
     HeightEstimate,
     HeightFlag,
-    HeightNumbers,
     HeightSettings,
     LidarNoise,
     Neighbours,
@@ -35,11 +32,9 @@ from jaxphoto.lidar.height_estimate import (
     lie_on_two_planes,
 )
 
-Method = Literal["idw", "plane", "tin", "local"]
+Method = Literal["plane", "local"]
 # Batch sizes of positions; calls are padded to these, for few compiled programs.
 _PLACES = (64, 512, 4096)
-# Factor by which the number of points for a triangle is increased, and its maximum.
-_MORE, _MOST = 4, 384
 # Maximum number of points for the surface, for clouds much denser than their horizontal errors.
 _MOST_WIDE = 4 * WIDE
 
@@ -76,10 +71,10 @@ class Heights(eqx.Module):
 def heights_at(
     cloud: Cloud | Grid,
     xy: Float[np.ndarray, "places 2"],
-    method: Method = "idw",
+    method: Method = "plane",
     settings: HeightSettings | None = None,
 ) -> Heights:
-    """Interpolate heights of the cloud at X, Y (m) by one of four methods, with standard deviations and flags.
+    """Interpolate heights of the cloud at X, Y (m) by one of two methods, with standard deviations and flags.
 
     Pass a `Grid` to avoid re-indexing the cloud. Positions with a flag of `settings.refuse` are NaN; `Heights.flag`
     gives the reason. 95 % of the errors are within 1.96 standard deviations.
@@ -93,53 +88,18 @@ def heights_at(
     if xy.ndim != 2 or xy.shape[1] != 2 or not np.isfinite(xy).all():
         raise InputError("invalid places; give an array of two columns, X_m and Y_m, without NaN")
     grid = cloud if isinstance(cloud, Grid) else index_cloud(cloud)
-    wide = max(WIDE, TIMES * settings.points, _points_of_noise(grid, settings.sigma_xy_m))
-    if settings.radius_m is not None:
-        wide = _points_of_radius(grid, xy, settings.radius_m, wide)
+    # Mean number of points within the range of horizontal errors; a multiple of `WIDE`.
+    covered = np.count_nonzero(np.diff(grid.start)) * float(grid.cell_m) ** 2
+    many = np.pi * (APART * settings.sigma_xy_m) ** 2 * len(grid) / covered
+    wide = max(WIDE, TIMES * settings.points, min(WIDE * int(np.ceil(many / WIDE)), _MOST_WIDE))
     estimate = _estimates(grid, xy, method, settings, wide)
     return _judged(estimate, _broken(grid, xy, estimate, wide), settings)
 
 
-def _points_of_noise(grid: Grid, sigma_xy_m: float) -> int:
-    """Return the mean number of points within the range of horizontal errors; a multiple of `WIDE`."""
-    covered = np.count_nonzero(np.diff(grid.start)) * float(grid.cell_m) ** 2
-    many = np.pi * (APART * sigma_xy_m) ** 2 * len(grid) / covered
-    return min(WIDE * int(np.ceil(many / WIDE)), _MOST_WIDE)
-
-
-def _points_of_radius(grid: Grid, xy: np.ndarray, radius_m: float, wide: int) -> int:
-    """Return a neighbour count of at least `TIMES` the maximum number of points within the radius of any position."""
-    while wide < len(grid):
-        within = (nearest(grid, xy, wide).distance <= radius_m).sum(axis=1).max(initial=0)
-        if TIMES * within <= wide:
-            break
-        wide *= 2
-    return wide
-
-
 def _estimates(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> HeightEstimate:
-    """Estimate all positions; repeat with more points where the triangle may change."""
-    estimate = _with_points(grid, xy, method, settings, k)
-    refused = estimate.hole * HeightFlag.HOLE | ~estimate.surrounded * HeightFlag.EDGE
-    left = np.flatnonzero(~estimate.final & (refused & settings.refuse == 0))
-    while len(left) and k < min(_MOST, len(grid)):
-        k *= _MORE
-        again = _with_points(grid, xy[left], method, settings, k)
-        for old, new in zip(estimate, again, strict=True):
-            old[left] = new
-        left = left[~again.final]
-    if k < len(grid):
-        np.asarray(estimate.height)[left] = np.nan
-    return estimate
-
-
-def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSettings, k: int) -> HeightEstimate:
     """Estimate positions from their `k` nearest points, in batches of few sizes."""
     most = max(1, _PLACES[-1] * WIDE // k)
     noise = LidarNoise(np.array(settings.sigma_z_m), np.array(settings.sigma_xy_m))
-    numbers = HeightNumbers(
-        np.array(settings.points), np.array(settings.power), np.array(settings.radius_m or 0.0), noise
-    )
     # Process one portion even without positions.
     parts, sizes = [], [*(size for size in _PLACES if size < most), most]
     for first in range(0, max(len(xy), 1), most):
@@ -147,7 +107,7 @@ def _with_points(grid: Grid, xy: np.ndarray, method: Method, settings: HeightSet
         room = next(size for size in sizes if len(some) <= size)
         padded = np.concatenate([some, np.broadcast_to(grid.xyz[0, :2], (room - len(some), 2))])
         near, base, leafy = _neighbours(grid, padded, k)
-        part = call_compiled(estimate_heights, near, leafy, numbers, method)
+        part = call_compiled(estimate_heights, near, leafy, np.array(settings.points), noise, method)
         part = HeightEstimate(*(np.array(v)[: len(some)] for v in part))
         parts.append(part._replace(height=part.height + base[: len(some)]))
     return HeightEstimate(*(np.concatenate(v) for v in zip(*parts, strict=True)))

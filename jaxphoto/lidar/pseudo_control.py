@@ -137,14 +137,12 @@ def pseudo_control_points(
     features.
 
     `xyz` is differentiable with respect to `interior`, `exterior` and `xy`, exactly except where the set of nearest
-    points changes; `sigma_z` and the other properties are not. Raises InputError for an unknown interpolation, a radius
-    in `settings`, and an empty `xy`. Source: paper 001, section 3.1.
+    points changes; `sigma_z` and the other properties are not. Raises InputError for an unknown interpolation and an
+    empty `xy`. Source: paper 001, section 3.1.
     """
     settings = HeightSettings() if settings is None else settings
     if interpolation not in get_args(Interpolation):
         raise InputError(f"unknown interpolation {interpolation!r}; choose one of {', '.join(get_args(Interpolation))}")
-    if settings.radius_m is not None:
-        raise InputError("pseudo control uses the nearest laser points in the image: give points, not radius_m")
     numbers = (
         settings.power,
         settings.sigma_z_m,

@@ -224,8 +224,6 @@ def test_wrong_use_is_told_in_a_sentence():
         pseudo_control_points(CAMERA, image(0), np.zeros((1, 2)), grid, interpolation="spline")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="give one or more image coordinates"):
         pseudo_control_points(CAMERA, image(0), np.zeros((0, 2)), grid)
-    with pytest.raises(InputError, match="give points, not radius_m"):
-        pseudo_control_points(CAMERA, image(0), np.zeros((1, 2)), grid, HeightSettings(radius_m=2.0))
 
 
 @pytest.mark.parametrize("interpolation", slow_but(("plane",), ("weighted", "plane")))

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from jaxphoto import InputError
-from jaxphoto.lidar.raster import Raster
+from jaxphoto.lidar.strip_planes import Raster
 from jaxphoto.report import (
     plot_draws,
     plot_effects,

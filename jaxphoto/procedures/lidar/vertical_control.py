@@ -32,7 +32,7 @@ from jaxphoto.procedures.lidar.iterate_to_convergence import (
 )
 from jaxphoto.statistics import Covariance
 
-Method = Literal["idw", "plane", "tin", "local", "image"]
+Method = Literal["plane", "local", "image"]
 METHODS = get_args(Method)
 """Names of the interpolation methods."""
 
