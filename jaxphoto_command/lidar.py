@@ -226,8 +226,7 @@ def strips(
         ),
     ] = None,
     pattern: Annotated[
-        Literal["line", "circle", "oscillating", "rotating", "risley", "nutating"] | None,
-        Option(help="Scan pattern (default: line)."),
+        Literal["line", "circle"] | None, Option(help="Scan pattern on the ground (default: line).")
     ] = None,
     block: Annotated[
         Path | None, Option(help="Block folder of photographs on this trajectory, to adjust with the strips.")
@@ -236,9 +235,6 @@ def strips(
         float, Option(callback=opt.finite, help="Point cloud time minus time_s of images.csv.")
     ] = 0.0,
     control: Annotated[Path | None, Option(help="Surveyed points on smooth surfaces (docs/control.md).")] = None,
-    breaklines: Annotated[
-        str | None, Option(help="Tie points on breaklines, comma-separated, * as wildcard (default: from block.toml).")
-    ] = None,
     hold: Annotated[str, Option(help="Strips with a fixed trajectory, comma-separated.")] = "",
     cell_m: Annotated[float, Option(callback=opt.positive, help="Cell size of the plane search.")] = 3.0,
     roughness_m: Annotated[
@@ -270,10 +266,8 @@ def strips(
     import numpy as np
 
     from jaxphoto.block import Frame
-    from jaxphoto.errors import InputError
     from jaxphoto.io import clouds, read_block, write_block
     from jaxphoto.io.block_folder import exposure_times
-    from jaxphoto.io.text_tables import points_matching
     from jaxphoto.io.trajectory import trajectory_in, with_poses, write_moved
     from jaxphoto.lidar.correction import correct_strips, scanner_path
     from jaxphoto.lidar.strip_planes import StripSettings, strip_differences
@@ -300,15 +294,12 @@ def strips(
         for name in free - set(SCANNER):
             raise typer.BadParameter(f"--adjust {name!r}: choose from {', '.join(SCANNER)}.")
         priors = scanner_priors(free, pattern)
-    if breaklines is not None and block is None:
-        raise InputError("--breaklines needs points of photographs: add their block (--block), or omit it")
     check_folder(out, cloud, *(path for path in (trajectory, block, control) if path is not None))
     with output.progress("reading the cloud") as progress:
         photographs, frame, records, path = None, None, None, None
         if block is not None:
             read = read_block(block)
-            lines = points_matching(read.points, opt.names(breaklines), "--breaklines")
-            photographs, frame = Photographs(read, exposure_times(block) + exposure_shift_s, lines), read.frame
+            photographs, frame = Photographs(read, exposure_times(block) + exposure_shift_s), read.frame
         if trajectory is not None:
             records = _cloud_records(trajectory, trajectory_shift_s)
             if records.geographic and frame is None:
@@ -359,12 +350,12 @@ def strips(
 
 def scanner_priors(free: Collection[str], pattern: str | None) -> "ScannerPriors":
     """Return priors with the scanner parameters `free` FREE and all others FIXED."""
-    from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
+    from jaxphoto.georeferencing import ScannerCalibration
     from jaxphoto.procedures.lidar import ScannerPriors
     from jaxphoto.unknowns import FIXED, FREE
 
     boresight, *calibration = (FREE if name in free else FIXED for name in SCANNER)
-    return ScannerPriors(boresight, ScannerCalibration(*calibration, PATTERN_OF[pattern or "line"]))  # type: ignore[arg-type, call-arg]
+    return ScannerPriors(boresight, ScannerCalibration(*calibration, pattern or "line"))  # type: ignore[arg-type, call-arg]
 
 
 def write_corrected(

@@ -58,9 +58,7 @@ def test_commands_without_an_extra_start():
             "cv2",
             "photos",
         ),
-        pytest.param(
-            "from jaxphoto.io import clouds; clouds._laspy()", "laspy", "lidar", marks=pytest.mark.slow
-        ),
+        pytest.param("from jaxphoto.io import clouds; clouds._laspy()", "laspy", "lidar", marks=pytest.mark.slow),
     ],
 )
 def test_a_missing_extra_is_named_with_the_line_that_installs_it(program, module, extra):

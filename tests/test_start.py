@@ -9,19 +9,20 @@ import sys
 from typing import get_args
 
 import pytest
-from jaxphoto.io.clouds import Returns
 from typer.main import get_command
 
 from jaxphoto.camera.undistortion import Keep
 from jaxphoto.extras.formats import CAMERAS_WRITTEN, LOSS_PX
 from jaxphoto.extras.photos.features import LONGEST_PX
-from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
+from jaxphoto.georeferencing import PATTERNS, ScannerCalibration
+from jaxphoto.io.clouds import Returns
 from jaxphoto.io.shipped import EXAMPLES
+from jaxphoto.lidar.heights import Method
 from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.losses import LOSSES
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.procedures.compare import CUTS
-from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
+from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA
 from jaxphoto.procedures.lidar.iterate_to_convergence import MAX_ROUNDS
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
 from jaxphoto.procedures.lidar.vertical_control import METHODS
@@ -48,8 +49,8 @@ CHOICES = [
     (photographs.undistort, "keep", get_args(Keep)),
     (lidar.lidar_control, "method", METHODS),
     (lidar.lidar_control, "returns", get_args(Returns)),
-    (lidar.simultaneous, "method", SURFACES),
-    (lidar.strips, "pattern", PATTERN_OF),
+    (lidar.simultaneous, "method", get_args(Method)),
+    (lidar.strips, "pattern", PATTERNS),
 ]
 DEFAULTS = [
     (blocks.sensitivity, "delta0", DELTA0),

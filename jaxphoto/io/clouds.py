@@ -65,7 +65,7 @@ def read_cloud(
         part = placement.placed(chunk)
         mask = np.ones(len(part), bool) if part.withheld is None else ~part.withheld
         if part.classification is not None:
-            mask &= ~np.isin(part.classification, _NOISE) if classes is None else np.isin(part.classification, classes)
+            mask &= ~np.isin(part.classification, _NOISE) if classes is None else np.isin(part.classification, list(classes))
         elif classes is not None and classes != EVERY_CLASS:
             raise InputError(f"{path.name} has no classification; remove the selection of classes")
         if returns != "all":
@@ -342,8 +342,8 @@ def _chunks(path: Path) -> Iterator[Cloud]:
     for name in ("classification", *_RETURNS):
         if name in table:
             values = table.numbers(name)
-            wrong = (values < 0) | (values > 255) | (values % 1 != 0)
-            table.check(wrong, lambda line, n=name, v=values: f"{n} is {v[line]:g}; give a whole number up to 255")
+            for line in np.flatnonzero((values < 0) | (values > 255) | (values % 1 != 0))[:1]:
+                raise table.bad(line, f"{name} is {values[line]:g}; give a whole number up to 255")
             small[name] = values.astype(np.uint8)
     strip, strips = pd.factorize(table.text("strip")) if "strip" in table else (None, ())
     yield Cloud(

@@ -10,7 +10,6 @@ from jaxphoto.lidar.planes import (
     planar_patches,
     plane_distance,
     plane_feet,
-    ridge_line,
     roof_centroid,
 )
 from jaxphoto.lidar.pseudo_control import BlockControl, PseudoControl, pseudo_control_of_block, pseudo_control_points
@@ -18,5 +17,5 @@ from jaxphoto.lidar.pseudo_control import BlockControl, PseudoControl, pseudo_co
 __all__ = [
     "BlockControl", "Grid", "HeightFlag", "HeightSettings", "Heights", "Nearest", "Patch", "Plane", "PseudoControl",
     "around", "fit_plane", "heights_at", "index_cloud", "nearest", "planar_patches", "plane_distance", "plane_feet",
-    "pseudo_control_of_block", "pseudo_control_points", "ridge_line", "roof_centroid",
+    "pseudo_control_of_block", "pseudo_control_points", "roof_centroid",
 ]  # fmt: skip

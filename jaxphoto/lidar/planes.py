@@ -226,26 +226,6 @@ def roof_centroid(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "
     return points.mean(axis=0), np.cov(points.T) / len(points)
 
 
-def ridge_line(first: Plane, second: Plane) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return the intersection line of two roof faces: a point (m) on it between them, and its unit direction.
-
-    Raises InputError for planes that are parallel within three standard deviations.
-    """
-    direction = np.cross(first.normal, second.normal)
-    length = np.linalg.norm(direction)
-    tilt = np.sqrt(np.trace(first.covariance[:3, :3]) + np.trace(second.covariance[:3, :3]))
-    if length < _CUT * tilt:
-        raise InputError(
-            "the two planes are parallel within their standard deviations and have no intersection line; choose two "
-            "faces of different slope"
-        )
-    direction = direction / length
-    middle = (first.centroid + second.centroid) / 2
-    rows = np.stack([first.normal, second.normal, direction])
-    offset = [(plane.centroid - middle) @ plane.normal for plane in (first, second)]
-    return middle + np.linalg.solve(rows, [*offset, 0.0]), direction
-
-
 def _plane(xyz: np.ndarray, sigma: np.ndarray) -> Plane:
     return fit_plane(xyz, sigma[0], sigma[2])
 

@@ -151,8 +151,7 @@ def _knot_labels(result: StripAdjustment) -> list[list[str]]:
 def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """Assess a strip adjustment; `tables` contains its adjustment if it has images."""
     found = _sigma_naught(result) if tables is None else verdict_of(tables).findings
-    warnings = (Finding("message", "warning", sentence) for sentence in result.warnings)
-    return Verdict.of((*_lookups(result), *_steps(result), *warnings, *_surveyed(result), *found))
+    return Verdict.of((*_lookups(result), *_steps(result), *_surveyed(result), *found))
 
 
 def _lookups(result: StripAdjustment) -> Iterator[Finding]:

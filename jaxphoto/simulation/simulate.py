@@ -45,7 +45,7 @@ from jaxphoto.simulation.plans import ConvergentPlan, FlightPlan
 from jaxphoto.simulation.points import TruePoints, scatter, thin_rays
 from jaxphoto.simulation.recipe import Assumed, Recipe, SimulatedBias, Triple, triple
 from jaxphoto.simulation.sampling import stream
-from jaxphoto.simulation.scan import Path, Scan, exposure_times, paths, recorded_on_path, scan
+from jaxphoto.simulation.scan import exposure_times, paths, recorded_on_path, scan
 from jaxphoto.simulation.scene import Terrain
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
 
@@ -103,12 +103,20 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     mounts = [recipe.mounts[name].truth if (name := recipe.mount_of(c)) else NO_MOUNT for c in flight.cameras]
     motions = camera_motions(flight.exterior, flight.motion.velocity, flight.motion.rate, mounts)
     biases = _true_biases(recipe, flight, seed)
-    flown = [] if recipe.lidar is None else paths(recipe, recipe.lidar, alone, height, seed)
-    cloud, trajectory, scanner, errors = _scanned(recipe, flown, terrain, seed)
+    flown = [] if recipe.lidar is None else paths(recipe, recipe.lidar, alone)
+    cloud = trajectory = scanner = errors = None
+    if recipe.lidar is not None:
+        cloud, trajectory, scanner, errors = scan(recipe.lidar, flown, terrain, _sigma(recipe.noise.lidar_m), seed)
     on_path = recipe.lidar is not None and recipe.lidar.same_trajectory
-    clock = exposure_times(flown, alone)[event] if on_path else _clock(recipe, event)
+    # Times per strip are sufficient unless cameras change.
+    clock = None
+    if on_path:
+        clock = exposure_times(flown, alone)[event]
+    elif (recipe.changes or recipe.temperature) and isinstance(recipe.plan, FlightPlan):
+        clock = recipe.plan.clock[event]
     times = flight.time if clock is None else clock
-    temperatures = _temperatures(recipe, times)
+    cooling = recipe.temperature
+    temperatures = None if cooling is None else Temperatures(cooling.at(times), cooling.reference_c)
     when = Circumstances(times, np.zeros(len(times)) if temperatures is None else np.asarray(temperatures.above))
     changes = draw_changes(recipe, flight, times, seed)
     scene = scene._replace(rays=reproject_changing(recipe, flight, scene.rays, scene.xyz, motions, when, changes))
@@ -141,23 +149,6 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         more=(*camera_steps(recipe, flight, times, start.unknowns), *rig_rows(recipe, flight), *relative),
     )  # fmt: skip
     return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory, errors)
-
-
-def _scanned(recipe: Recipe, flown: list[Path], terrain: Terrain, seed: int) -> Scan | tuple[None, None, None, None]:
-    if recipe.lidar is None:
-        return None, None, None, None
-    return scan(recipe.lidar, flown, terrain, _sigma(recipe.noise.lidar_m), seed)
-
-
-def _clock(recipe: Recipe, event: Int[np.ndarray, "images"]) -> Float[np.ndarray, "images"] | None:
-    """Return the time of every exposure from the middle of the flight (s); None if times per strip are sufficient."""
-    changing = recipe.changes or recipe.temperature
-    return recipe.plan.clock[event] if changing and isinstance(recipe.plan, FlightPlan) else None
-
-
-def _temperatures(recipe: Recipe, times: Float[np.ndarray, "images"]) -> Temperatures | None:
-    cooling = recipe.temperature
-    return None if cooling is None else Temperatures(cooling.at(times), cooling.reference_c)
 
 
 def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TruePoints:

@@ -210,7 +210,6 @@ def test_withheld_points_that_nothing_says_anything_of_stay(cloud_file, tmp_path
         (("--sigma-heading-deg", "inf"), "'--sigma-heading-deg': inf is not a positive number"),
         (("--trajectory-shift-s", "nan"), "'--trajectory-shift-s': nan is not a finite number"),
         (("--exposure-shift-s", "inf"), "'--exposure-shift-s': inf is not a finite number"),
-        (("--breaklines", "R*"), "--breaklines needs points of photographs: add their block (--block)"),
         (("--cell-m", "0.3"), "strip 1 has fewer than 10 planes in common"),
     ],
 )

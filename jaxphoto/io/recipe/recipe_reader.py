@@ -4,7 +4,6 @@ Cameras, mounts, strips and datum have the keys of block.toml. Their subtable `t
 (docs/simulation.md).
 """
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,6 @@ from jaxphoto.simulation import (
     ConvergentPlan,
     Field,
     FlightPlan,
-    Footprint,
     Recipe,
     ScanPlan,
     Settlement,
@@ -410,28 +408,8 @@ def _lidar(
         raise sigmas.error(
             "lidar_m", "the key is missing, but the recipe has lidar; add its sigmas, like [0.5, 0.5, 0.15]"
         )
-    strips = tuple(_lidar_strip(strip, plan.speed_m_per_s, top) for strip in keys.lidar.strips)
-    truth, names = keys.lidar.truth.plan(density_per_m2=1.0), [strip.name for strip in strips or plan.strips]
+    truth, names = keys.lidar.truth.plan(density_per_m2=1.0), [strip.name for strip in plan.strips]
     for key in ("shift_m", "drift_m_per_s", "attitude_deg", "attitude_drift_deg_per_s"):
         top.section("lidar").section("truth").section(key).known("default", *names)
     given = {name: getattr(truth, name) for name in keys.lidar.truth.model_fields_set}
-    return keys.lidar.plan(**given, strips=strips)
-
-
-def _lidar_strip(keys: Any, speed: float, top: Section) -> Strip:
-    """Read a strip of a separate scanner flight."""
-    nodes = 1 + max(1, math.ceil(keys.length_m / (_NODES_S * speed)))
-    if nodes > IMAGES:
-        hours = keys.length_m / speed / 3600
-        raise top.section("lidar").error("strips", f"strip {keys.name} takes {hours:.3g} hours; make length_m shorter")
-    return Strip(
-        name=keys.name,
-        camera="",
-        heading_deg=keys.heading_deg,
-        images=nodes,
-        base_m=keys.length_m / (nodes - 1),
-        height_m=keys.height_m,
-        footprint=Footprint(0.0, 0.0),
-        along_m=keys.along_m,
-        across_m=keys.across_m,
-    )
+    return keys.lidar.plan(**given)

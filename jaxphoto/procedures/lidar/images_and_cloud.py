@@ -9,7 +9,7 @@ from it.
 
 import dataclasses
 from collections.abc import Callable, Collection
-from typing import Any, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -53,8 +53,6 @@ from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import Covariance
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 
-SURFACES = get_args(Method)
-"""Names of the surface interpolation methods."""
 SHIFT_SIGMA = 0.3
 """Default standard deviation (m) of a lidar strip's shift."""
 # Number of laser points of a strip near a tie point that can affect its surface; minimum ratio to the number used for

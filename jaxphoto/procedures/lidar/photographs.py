@@ -28,13 +28,6 @@ class Photographs(NamedTuple):
     """Block whose stations and attitudes come from the trajectory."""
     time: Float[np.ndarray, "images"]
     """Exposure times in seconds."""
-    on_breaklines: tuple[str, ...] = ()
-    """Names of tie points on breaklines; by default `block.breaklines`."""
-
-    @property
-    def breaklines(self) -> tuple[str, ...]:
-        """Return tie points at the intersection of two smooth faces, such as the ridge of a roof."""
-        return self.on_breaklines or self.block.breaklines
 
 
 def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -> None:
@@ -117,9 +110,7 @@ def on_trajectory(
     angles = np.asarray(a.roll_pitch_yaw)
     attitude = TrajectoryAttitudes(a.image, knots[a.image], weights[a.image], angles, np.full(angles.shape, turn))
     more = (*block.more, position, *([attitude] if len(attitude) else []))
-    return dataclasses.replace(
-        block, stations=CameraPositions.none(), attitudes=Attitudes.none(), breaklines=photographs.breaklines, more=more
-    )
+    return dataclasses.replace(block, stations=CameraPositions.none(), attitudes=Attitudes.none(), more=more)
 
 
 def _strip_of(time: Float[np.ndarray, "images"], spans: Float[np.ndarray, "strips 2"]) -> Int[np.ndarray, "images"]:

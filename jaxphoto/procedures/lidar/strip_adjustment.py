@@ -115,8 +115,6 @@ class StripAdjustment(eqx.Module):
     rounds: tuple[StripRound, ...]
     converged: bool
     """True if the iteration converged."""
-    warnings: tuple[str, ...] = ()
-    """Messages about inconsistencies of cloud and trajectory."""
     surveyed: tuple[SurveyedGap, ...] = ()
     """Control and check points above the planes of strips: one item per point and plane."""
 
@@ -138,8 +136,8 @@ def adjust_strips(
     Standard deviations in the trajectory replace the values of `settings`; zero means unknown.
 
     `photographs` of the same flight are also adjusted: their exposures have the trajectory's errors, and their tie
-    points lie on the planes of the strips, points on breaklines on both faces. Their block defines the unknowns of
-    cameras and mounts; its stations and attitudes are assumed to come from the trajectory.
+    points lie on the planes of the strips. Their block defines the unknowns of cameras and mounts; its stations and
+    attitudes are assumed to come from the trajectory.
 
     `control` contains surveyed points on smooth surfaces, in the cloud's system (m): planes near them are observed to
     pass through them. Its check points are only compared. Without a trajectory control also defines the datum.
@@ -196,8 +194,7 @@ def adjust_strips(
     check_joined(names, common)
     ties = None
     if images is not None and photographs is not None:
-        lines = tie_points(images, photographs.breaklines)
-        ties = PointSearch(search, np.setdiff1d(tie_points(images), lines), lines)
+        ties = PointSearch(search, tie_points(images))
     first_on_ties = on_ties = (
         []
         if ties is None or before_strips is None
@@ -246,7 +243,6 @@ def adjust_strips(
                 + _point_differences(CHECK, first_on_surveyed.check, on_surveyed.check),
                 tuple(rounds),
                 converged,
-                () if ties is None else tuple(ties.unseen(on_ties, adjusted.block.points)),
                 () if control is None else surveyed_gaps(control, on_surveyed, errors, path, adjusted, cov),
             )
         # Free gigabytes for large flights before the next iteration.
