@@ -376,7 +376,7 @@ def write_corrected(
 
     from jaxphoto.errors import InputError, counted
     from jaxphoto.io import clouds
-    from jaxphoto.lidar.coverage import covers
+    from jaxphoto.lidar.correction import covers
 
     def moved(part: "Cloud") -> np.ndarray:
         part = part.numbered(strips)

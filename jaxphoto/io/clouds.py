@@ -65,7 +65,11 @@ def read_cloud(
         part = placement.placed(chunk)
         mask = np.ones(len(part), bool) if part.withheld is None else ~part.withheld
         if part.classification is not None:
-            mask &= ~np.isin(part.classification, _NOISE) if classes is None else np.isin(part.classification, list(classes))
+            mask &= (
+                ~np.isin(part.classification, _NOISE)
+                if classes is None
+                else np.isin(part.classification, list(classes))
+            )
         elif classes is not None and classes != EVERY_CLASS:
             raise InputError(f"{path.name} has no classification; remove the selection of classes")
         if returns != "all":

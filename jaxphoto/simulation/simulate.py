@@ -18,7 +18,6 @@ from jaxphoto.georeferencing import Mount, RigCamera, StripBias, StripErrors, Tr
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.short_repr import simulation_html, simulation_repr
 from jaxphoto.simulation.camera_changes import (
-    Circumstances,
     camera_motions,
     camera_steps,
     draw_changes,
@@ -117,9 +116,11 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     times = flight.time if clock is None else clock
     cooling = recipe.temperature
     temperatures = None if cooling is None else Temperatures(cooling.at(times), cooling.reference_c)
-    when = Circumstances(times, np.zeros(len(times)) if temperatures is None else np.asarray(temperatures.above))
+    above = np.zeros(len(times)) if temperatures is None else np.asarray(temperatures.above)
     changes = draw_changes(recipe, flight, times, seed)
-    scene = scene._replace(rays=reproject_changing(recipe, flight, scene.rays, scene.xyz, motions, when, changes))
+    scene = scene._replace(
+        rays=reproject_changing(recipe, flight, scene.rays, scene.xyz, motions, times, above, changes)
+    )
     truth = Unknowns(
         {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
         flight.exterior,

@@ -9,7 +9,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.georeferencing import Trajectory, covered
 from jaxphoto.georeferencing.time_scales import shift_that_fits
-from jaxphoto.lidar.coverage import check_covered, covers, longest_interval
+from jaxphoto.lidar.correction import check_covered, covers, longest_interval
 
 WEEK, DAY = 604_800.0, 86_400.0
 

@@ -2,10 +2,9 @@
 
 from jaxphoto.procedures.lidar.images_and_cloud import Simultaneous, simultaneous
 from jaxphoto.procedures.lidar.iterate_to_convergence import Round
-from jaxphoto.procedures.lidar.photographs import Photographs
 from jaxphoto.procedures.lidar.roof_control import RoofControl, roof_control
 from jaxphoto.procedures.lidar.strip_adjustment import StripAdjustment, StripDifference, StripRound, adjust_strips
-from jaxphoto.procedures.lidar.strip_model import ScannerPriors
+from jaxphoto.procedures.lidar.strip_model import Photographs, ScannerPriors
 from jaxphoto.procedures.lidar.vertical_control import LidarControl, lidar_control
 
 __all__ = [

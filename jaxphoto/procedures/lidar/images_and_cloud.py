@@ -27,6 +27,7 @@ from jaxphoto.lidar import Grid, HeightSettings, index_cloud, nearest
 from jaxphoto.lidar.correction import (
     ScannerPath,
     ScannerPoses,
+    check_covered,
     correct_cloud,
     correct_trajectory,
     corrected_xyz,
@@ -34,8 +35,7 @@ from jaxphoto.lidar.correction import (
     scanner_path,
     scanner_poses,
 )
-from jaxphoto.lidar.coverage import check_covered
-from jaxphoto.lidar.heights import Method, TangentPlanes, tangent_planes
+from jaxphoto.lidar.heights import Method, heights_at
 from jaxphoto.observations import SurfaceRows
 from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,
@@ -145,26 +145,24 @@ def simultaneous(
     none: Scanner = jax.tree.map(np.asarray, Scanner(jnp.zeros(3), dict.fromkeys(names, jnp.zeros(3))))
     strip = np.repeat(np.arange(len(names)), len(which))
 
-    def planes(adjusted: Adjustment) -> list[tuple[TangentPlanes, ScannerPoses | None]]:
-        scanner = adjusted.unknowns.scanner or none
-        xy = np.asarray(adjusted.unknowns.points)[which, :2]
-        result = []
-        for of, shift in zip(strips, scanner.shifts.values(), strict=True):
-            near, poses = _near(of, xy, scanner.boresight, shift, settings)
-            index_of = tangent_planes(index_cloud(near), xy, method, settings)
-            result.append(
-                (index_of, None if poses is None else jax.tree.map(lambda v, k=index_of.nearest: v[k], poses))
-            )
-        return result
-
     last: dict[str, Any] = {}
 
     def look(adjusted: Adjustment) -> SurfaceAtPoints:
-        last["planes"] = planes(adjusted)
-        foot, normal, sigma, flag = (
-            np.concatenate([getattr(p, name) for p, _ in last["planes"]])
-            for name in ("foot", "normal", "sigma", "flag")
-        )
+        scanner = adjusted.unknowns.scanner or none
+        xy = np.asarray(adjusted.unknowns.points)[which, :2]
+        last["poses"], planes = [], []
+        for of, shift in zip(strips, scanner.shifts.values(), strict=True):
+            near, poses = _near(of, xy, scanner.boresight, shift, settings)
+            grid = index_cloud(near)
+            heights = heights_at(grid, xy, method, settings)
+            # Tangent plane; the height error is projected onto its normal.
+            normal = np.column_stack([-heights.gradient, np.ones(len(xy))])
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            normal[np.isnan(heights.z)] = np.nan
+            planes.append((np.column_stack([xy, heights.z]), normal, heights.sigma * normal[:, 2], heights.flag))
+            one = np.asarray(grid.order)[nearest(grid, xy, 1).index[:, 0]]
+            last["poses"].append(None if poses is None else jax.tree.map(lambda v, k=one: v[k], poses))
+        foot, normal, sigma, flag = map(np.concatenate, zip(*planes, strict=True))
         usable = np.isfinite(foot).all(axis=1)
         sigma = with_common_error(sigma, usable, settings.sigma_systematic_m)
         if not usable.any():
@@ -173,7 +171,7 @@ def simultaneous(
 
     def build(adjusted: Adjustment, cov: Covariance, surface: SurfaceAtPoints, used: np.ndarray) -> Block:
         scanner = adjusted.unknowns.scanner or none
-        last["turn"] = _turns(surface, strip, [poses for _, poses in last["planes"]])
+        last["turn"] = _turns(surface, strip, last["poses"])
         rows = _surface_rows(surface, used, strip, last["turn"], scanner)
         unknowns = dataclasses.replace(adjusted.unknowns, scanner=scanner)
         posed = dataclasses.replace(block, surfaces=rows, priors=dataclasses.replace(block.priors, scanner=priors))

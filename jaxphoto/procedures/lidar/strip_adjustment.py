@@ -18,14 +18,12 @@ from jaxphoto.block import empty_block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
-from jaxphoto.lidar.correction import correct_flight, scanner_path, times_of
-from jaxphoto.lidar.coverage import check_covered
+from jaxphoto.lidar.correction import check_covered, correct_flight, scanner_path, times_of
 from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import StripPoints
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.lidar.iterate_to_convergence import CHANGE_LIMIT, adjust_with_fixed_interior, at_result
-from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
 from jaxphoto.procedures.lidar.plane_search import CommonPlanes, PointPlanes, PointSearch, StripSearch, check_joined
 from jaxphoto.procedures.lidar.strip_control import (
     CHECK,
@@ -39,10 +37,14 @@ from jaxphoto.procedures.lidar.strip_control import (
     with_datum,
 )
 from jaxphoto.procedures.lidar.strip_model import (
+    Photographs,
     ScannerPriors,
     check_measured_from,
+    check_photographs,
     errors_of,
     knot_sigmas,
+    on_trajectory,
+    spans_with,
     step_rows,
     strip_block,
 )
