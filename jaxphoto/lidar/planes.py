@@ -226,10 +226,6 @@ def roof_centroid(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "
     return points.mean(axis=0), np.cov(points.T) / len(points)
 
 
-def _plane(xyz: np.ndarray, sigma: np.ndarray) -> Plane:
-    return fit_plane(xyz, sigma[0], sigma[2])
-
-
 def _of_house(
     xyz: np.ndarray, near: np.ndarray, even: np.ndarray, graph: "scipy.sparse.csr_matrix", sigma: np.ndarray, least: int
 ) -> list[Patch]:
@@ -265,7 +261,7 @@ def _faces(
     for member in members:
         points = xyz[member]
         if len(member) >= max(least, 4) and np.linalg.eigvalsh(np.cov(points[:, :2].T))[0] > (_WIDTH * sigma[0]) ** 2:
-            plane = _plane(points, sigma)
+            plane = fit_plane(points, sigma[0], sigma[2])
             if plane.sigma0 < _SPREAD:
                 faces.append(member)
                 planes.append(plane)

@@ -63,9 +63,7 @@ class Path(NamedTuple):
         return _hermite(self.node, self.position, self.velocity, time), quaternion / length
 
 
-def matrices(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return rotation matrices of quaternions."""
-    return in_chunks(_matrices_from_quaternions, _CHUNK_POINTS, quaternion)
+_matrices_from_quaternions = jax.jit(jax.vmap(matrix_from_quaternion))
 
 
 def paths(recipe: Recipe, plan: ScanPlan, flight: Flight) -> list[Path]:
@@ -125,12 +123,6 @@ def _turn(quaternion: Float[np.ndarray, "n 4"], rate: Float[np.ndarray, "n 3"]) 
 @jax.vmap
 def _quaternions_from_angles(roll_pitch_yaw):
     return quaternion_from_matrix(matrix_from_roll_pitch_yaw(roll_pitch_yaw))
-
-
-@jax.jit
-@jax.vmap
-def _matrices_from_quaternions(quaternion):
-    return matrix_from_quaternion(quaternion)
 
 
 def _hermite(
@@ -223,14 +215,6 @@ _PULSES_AT_ONCE = 500_000
 _PULSES = 1e8
 
 
-class _Returns(NamedTuple):
-    """Returns: index of the pulse, distance along the ray (m), class."""
-
-    pulse: Int[np.ndarray, "returns"]
-    at: Float[np.ndarray, "returns"]
-    by: UInt8[np.ndarray, "returns"]
-
-
 def scan(
     plan: ScanPlan, paths: list[Path], terrain: Terrain, noise_m: Float[np.ndarray, "3"], seed: int
 ) -> tuple[Cloud, Trajectory, Scanner, StripErrors]:
@@ -304,20 +288,20 @@ def _measured(
 ) -> dict[str, np.ndarray]:
     """Return the cloud fields of some pulses, sorted by time and return."""
     position, quaternion = path.pose(time)
-    object_from_body = believed_turn = matrices(quaternion)
+    object_from_body = believed_turn = in_chunks(_matrices_from_quaternions, _CHUNK_POINTS, quaternion)
     recorded, believed_position = time - errors.calibration.time_offset, position
     if errors.calibration.time_offset:
         believed_position, quaternion = path.pose(recorded)
-        believed_turn = matrices(quaternion)
+        believed_turn = in_chunks(_matrices_from_quaternions, _CHUNK_POINTS, quaternion)
     origin = position - object_from_body @ errors.calibration.lever_arm
     body_from_scanner = np.asarray(_small_rotation(errors.boresight))
     # The recorded ray assumes that the scanner axes are the body axes.
     believed = np.column_stack([aside, -np.ones(len(aside))])
     believed /= np.linalg.norm(believed, axis=1, keepdims=True)
     ray = _rotated(object_from_body, believed @ body_from_scanner.T)
-    returns = _returned(origin, ray, terrain, leaves)
-    order = np.lexsort((returns.at, returns.pulse))
-    pulse, at, by = (a[order] for a in returns)
+    pulse, at, by = _returned(origin, ray, terrain, leaves)
+    order = np.lexsort((at, pulse))
+    pulse, at, by = pulse[order], at[order], by[order]
     _, first, of_pulse, count = np.unique(pulse, return_index=True, return_inverse=True, return_counts=True)
     number = np.arange(len(pulse)) - first[of_pulse] + 1
     # Solve `corrected_return` for the recorded point; the noise applies to the corrected point.
@@ -338,7 +322,8 @@ def _measured(
 
 def _returned(
     origin: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"], terrain: Terrain, rng: np.random.Generator
-) -> _Returns:
+) -> tuple[Int[np.ndarray, "returns"], Float[np.ndarray, "returns"], UInt8[np.ndarray, "returns"]]:
+    """Return the pulse of each return, the distance along its ray (m), and its class."""
     ground = _ground(origin, ray, terrain)
     roof = wall = np.full(len(ray), np.inf)
     if terrain.buildings:
@@ -349,7 +334,7 @@ def _returned(
     last = np.flatnonzero(hits & (wall > end) & ~leaves.stopped)
     by_last = np.where(roof[last] <= ground[last], ROOF, GROUND)
     by = np.concatenate([np.full(len(leaves.pulse), VEGETATION), by_last]).astype(np.uint8)
-    return _Returns(np.concatenate([leaves.pulse, last]), np.concatenate([leaves.at, end[last]]), by)
+    return np.concatenate([leaves.pulse, last]), np.concatenate([leaves.at, end[last]]), by
 
 
 def _ground(origin: np.ndarray, ray: np.ndarray, terrain: Terrain) -> Float[np.ndarray, "n"]:
@@ -394,7 +379,11 @@ def _trajectory(paths: list[Path], errors: StripErrors) -> Trajectory:
     exact = np.zeros((len(position), 3))
     quaternion, turn = np.vstack([q for _, q in poses]), np.vstack([turn for _, turn in errors_at])
     if np.any(turn):
-        quaternion = in_chunks(_quaternions, _CHUNK_POINTS, rotate_body(matrices(quaternion), turn))
+        quaternion = in_chunks(
+            _quaternions,
+            _CHUNK_POINTS,
+            rotate_body(in_chunks(_matrices_from_quaternions, _CHUNK_POINTS, quaternion), turn),
+        )
     return Trajectory(np.concatenate(times), position, quaternion, exact, exact)  # type: ignore[arg-type]
 
 
