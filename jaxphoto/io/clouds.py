@@ -52,9 +52,6 @@ def read_cloud(
     metres. `classes` (default: all except noise, 7 and 18) and `returns` select points; withheld points are skipped.
     `within` (minimum and maximum X, Y in m) is the area of the block. `epsg` overrides the coordinate system of the
     file.
-
-    Raises InputError for a missing, damaged or empty file, a missing, unknown or incompatible coordinate system, and an
-    empty selection.
     """
     if returns not in get_args(Returns):
         raise InputError(f"unknown returns {returns!r}; choose one of {', '.join(get_args(Returns))}")
@@ -147,8 +144,6 @@ def rewrite_cloud(
     Both files have the same format. `moved` receives each part as in `read_cloud`, including noise and withheld points,
     and returns X, Y, Z (m) in the same `frame`; points for which it returns NaN are not moved. LAS and LAZ retain
     system, scale and all other dimensions, CSV the fields of `Cloud`; COPC is written as LAZ.
-
-    Raises OSError if writing fails, and the errors of `read_cloud` and `moved`.
     """
     source, path = Path(source), Path(path)
     suffix = _suffix(path)
@@ -214,8 +209,6 @@ class Placement:
     system, then to its local frame. Heights of an unknown system have the unit of the map, and are assumed to be in the
     block's vertical system. `plane` is the map or geographic system (None: local), `vertical` the EPSG code of the
     heights, "ellipsoid", or None if unknown, `factors` are metres per unit of X, Y and Z (1 for degrees).
-
-    Raises InputError if system and frame are incompatible.
     """
 
     def __init__(self, name: str, crs: CRS | None, frame: Frame | None):

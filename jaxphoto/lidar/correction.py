@@ -112,10 +112,7 @@ def scanner_path(trajectory: Trajectory) -> ScannerPath:
 
 
 def scanner_poses(path: ScannerPath, time: Float[np.ndarray, "n"]) -> ScannerPoses:
-    """Interpolate poses at the times of laser points (s).
-
-    Raises BlockError for times outside the trajectory.
-    """
+    """Interpolate poses at the times of laser points (s)."""
     if not len(time):
         return ScannerPoses(np.zeros((0, 3)), np.zeros((0, 3, 3)))
     position, turn, known = _along(_poses, path, time)
@@ -245,10 +242,7 @@ def corrected_strip(
     errors: StripErrors,
     path: ScannerPath | None,
 ) -> Float[np.ndarray, "n 3"]:
-    """Apply `georeferencing.corrected_return` to returns of one strip; without a path, only its constant shift.
-
-    Raises BlockError for times (s) outside the trajectory.
-    """
+    """Apply `georeferencing.corrected_return` to returns of one strip; without a path, only its constant shift."""
     if path is None:
         return xyz - errors.at(strip, time)[0]
     common = path.spline, errors.of_strip(strip), errors.boresight, errors.calibration

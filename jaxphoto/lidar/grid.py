@@ -66,8 +66,6 @@ def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"]) -> Grid:
 
     A nonempty cell contains about 4 points. The number of cells is at most about twice the number of points:
     for larger areas, isolated points are assigned to the border of the grid, and cells are enlarged.
-
-    Raises InputError for a cloud without points or with NaN coordinates.
     """
     xyz = np.asarray(cloud.xyz if isinstance(cloud, Cloud) else cloud, float)
     if not len(xyz):

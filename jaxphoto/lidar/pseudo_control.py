@@ -18,7 +18,7 @@ height of the point*, and g the slope of the ground. Seen along the ray, the sur
     Z = Z_0 + h . q,    h = g / (1 - g . t)
 
 and the error of a laser point is (1 + h . t) e_Z - h . e_XY: as a function of q it is a surface of slope h, measured
-with errors (1 + h . t) sigma_Z and sigma_XY. `height_estimate` propagates these errors, and the bias of weights that do
+with errors (1 + h . t) sigma_Z and sigma_XY. `heights` propagates these errors, and the bias of weights that do
 not reproduce a slope. The result is the accuracy of the surface height at the intersection, without errors of the ray.
 """
 
@@ -40,7 +40,7 @@ from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Corrections, apparent_point, ground_point
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
 from jaxphoto.lidar.grid import Grid, around, index_cloud
-from jaxphoto.lidar.height_estimate import (
+from jaxphoto.lidar.heights import (
     HeightFlag,
     HeightSettings,
     LidarNoise,

@@ -19,11 +19,6 @@ from jaxtyping import Bool, Float, Int
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 
-_POSITIVE = (
-    "cell_m", "roughness_m", "least_roughness_m", "normals_deg", "outlier", "knots_s", "correlation_s",
-    "sigma_position_m", "sigma_attitude_deg", "sigma_heading_deg", "sigma_exposure_m", "sigma_exposure_deg",
-)  # fmt: skip
-
 
 @dataclasses.dataclass(frozen=True)
 class StripSettings:
@@ -53,8 +48,7 @@ class StripSettings:
     sigma_exposure_deg: float = 0.002
 
     def __post_init__(self) -> None:
-        for name in _POSITIVE:
-            value = getattr(self, name)
+        for name, value in vars(self).items():
             if not (np.isfinite(value) and value > 0):
                 raise InputError(f"{name} is {value:g}: give a positive number")
         if self.returns < 4 or self.most < 1:

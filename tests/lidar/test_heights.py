@@ -11,7 +11,7 @@ from scipy.stats import norm
 from jaxphoto import InputError
 from jaxphoto.cloud import Cloud
 from jaxphoto.lidar import HeightFlag, HeightSettings, heights_at, index_cloud
-from jaxphoto.lidar.height_estimate import REFUSED, normal_equivalent
+from jaxphoto.lidar.heights import REFUSED, normal_equivalent
 from jaxphoto.lidar.sight import surrounded
 from tests.checked_types import unchecked
 from tests.lidar.clouds import SURFACES, gable, ground, places_over, read_autzen

@@ -13,7 +13,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import run
 from jaxphoto.errors import InputError
 from jaxphoto.lidar.grid import index_cloud
-from jaxphoto.lidar.height_estimate import HeightFlag, HeightSettings
+from jaxphoto.lidar.heights import HeightFlag, HeightSettings
 from jaxphoto.lidar.pseudo_control import pseudo_control_points
 from tests.derivatives import compiled
 

@@ -111,9 +111,6 @@ def simultaneous(
     `priors` are the priors of the scanner. By default its boresight is FREE if `trajectory` (of the scanner, on the
     cloud's clock) gives the scanner position of each point, and FIXED without one; shifts are weighted at zero with
     `SHIFT_SIGMA`. `points` are the names of points on the surface; None selects all tie points.
-
-    Raises BlockError if cloud and block, or cloud and trajectory, do not match; InputError for a boresight without
-    trajectory or times; and the errors of `jaxphoto.adjust`.
     """
     settings = HeightSettings() if settings is None else settings
     names = cloud.strips or ("cloud",)

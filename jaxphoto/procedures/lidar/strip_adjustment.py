@@ -148,11 +148,6 @@ def adjust_strips(
     FIXED. For circular patterns, forward and backward looks of a strip are also compared. `fixed` are strips whose
     trajectory is not corrected, or "all". Without a trajectory each strip has only a shift, and by default the first is
     fixed in the directions that control does not determine.
-
-    Raises InputError for a cloud of one strip without control, for strips without points or without the times that a
-    trajectory needs, for a time offset of a circular scanner and for control without heights or standard deviations;
-    BlockError for strips without common planes, for control away from them and for a trajectory that does not cover the
-    cloud or the exposures; and the errors of `jaxphoto.adjust`.
     """
     settings = StripSettings() if settings is None else settings
     if trajectory is None and priors is not None:
