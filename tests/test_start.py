@@ -27,7 +27,6 @@ from jaxphoto.procedures.lidar.iterate_to_convergence import MAX_ROUNDS
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
 from jaxphoto.procedures.lidar.vertical_control import METHODS
 from jaxphoto.procedures.model_choice import FOLDS
-from jaxphoto.report import TABLE_FORMATS
 from jaxphoto.sensitivity import PER
 from jaxphoto.sensitivity.influence import DELTA0, Per
 from jaxphoto.stability import METHODS as ALIGNMENTS
@@ -41,7 +40,6 @@ _STRIPS = StripSettings()
 CHOICES = [
     (blocks.adjust, "rotations", EOP_NAMES),
     (blocks.adjust, "robust", LOSSES),
-    (blocks.tables, "to", TABLE_FORMATS),
     (blocks.monte_carlo, "kind", [*PER, "noise"]),
     (blocks.sensitivity, "per", get_args(Per)),
     (blocks.halves, "method", ALIGNMENTS),

@@ -167,11 +167,11 @@ def _pseudo_control(
             nearness, first = jax.lax.top_k(-squared, min(_CANDIDATES * points, len(squared)))
             index, there = index[first], jnp.isfinite(nearness)
             z = cloud[index, 2]
-            level = levels(cloud[index, :2] - ray.at(z), z, there, ray.run, points, settings.sigma_z_m)
-            near = level.seen & (jnp.cumsum(level.seen) <= points)
+            seen, near_step = levels(cloud[index, :2] - ray.at(z), z, there, ray.run, points, settings.sigma_z_m)
+            near = seen & (jnp.cumsum(seen) <= points)
             mean = jnp.sum(jnp.where(near, z, 0)) / jnp.maximum(near.sum(), 1)
             # Keep `broken` of earlier iterations: the image may show a step that the ray passes.
-            return jnp.where(near.any(), ray.at(mean), place), (index, level.seen, level.broken | broken)
+            return jnp.where(near.any(), ray.at(mean), place), (index, seen, near_step | broken)
 
         some = around(grid, place, reach)[0][: _CANDIDATES * points]
         none = some, jnp.zeros(len(some), bool), jnp.array(False)

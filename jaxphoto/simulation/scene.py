@@ -201,13 +201,6 @@ class Tree:
     radius_m: float
 
 
-class Crowns(NamedTuple):
-    """Ellipsoids about `centre` with half axes `half` (m)."""
-
-    centre: Float[np.ndarray, "trees 3"]
-    half: Float[np.ndarray, "trees 3"]
-
-
 class Leaves(NamedTuple):
     """Hits of leaves: index of the pulse, distance along its ray (m); mask of the pulses that ended there."""
 
@@ -216,12 +209,12 @@ class Leaves(NamedTuple):
     stopped: Bool[np.ndarray, "pulses"]
 
 
-def crowns(trees: Sequence[Tree]) -> Crowns:
-    """Return the crowns of `trees`."""
+def crowns(trees: Sequence[Tree]) -> tuple[Float[np.ndarray, "trees 3"], Float[np.ndarray, "trees 3"]]:
+    """Return centres and half axes (m) of the ellipsoidal crowns of `trees`."""
     upright = [(1 - _BARE) / 2 * t.height_m for t in trees]
     centre = [(*t.at_m, t.foot_m + t.height_m - up) for t, up in zip(trees, upright, strict=True)]
     half = [(t.radius_m, t.radius_m, up) for t, up in zip(trees, upright, strict=True)]
-    return Crowns(np.array(centre).reshape(-1, 3), np.array(half).reshape(-1, 3))
+    return np.array(centre).reshape(-1, 3), np.array(half).reshape(-1, 3)
 
 
 def under_crown(trees: Sequence[Tree], xy: Float[np.ndarray, "n 2"], margin_m: float) -> Bool[np.ndarray, "n"]:

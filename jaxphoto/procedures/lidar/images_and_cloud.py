@@ -9,7 +9,7 @@ from it.
 
 import dataclasses
 from collections.abc import Callable, Collection
-from typing import Any, NamedTuple
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -86,14 +86,6 @@ class Simultaneous(eqx.Module):
     """True if the iteration converged."""
 
 
-class _Strip(NamedTuple):
-    """Measured laser points of one strip, and the scanner path."""
-
-    cloud: Cloud
-    grid: Grid
-    path: ScannerPath | None
-
-
 def simultaneous(
     block: Block,
     cloud: Cloud,
@@ -138,7 +130,12 @@ def simultaneous(
     path = scanner_path(trajectory) if timed else None  # type: ignore[arg-type]
     if path is not None:
         check_measured_from(cloud, path)
-    strips = _strips(cloud, names, path)
+    strips = []
+    for k, name in enumerate(names):
+        returns = cloud if cloud.strip is None else cloud.take(np.flatnonzero(cloud.strip == k))
+        if not len(returns):
+            raise InputError(f"strip {name} of the cloud has no points: omit it, or read other classes and returns")
+        strips.append((returns, index_cloud(returns.xyz)))
     none: Scanner = jax.tree.map(np.asarray, Scanner(jnp.zeros(3), dict.fromkeys(names, jnp.zeros(3))))
     strip = np.repeat(np.arange(len(names)), len(which))
 
@@ -149,7 +146,7 @@ def simultaneous(
         xy = np.asarray(adjusted.unknowns.points)[which, :2]
         last["poses"], planes = [], []
         for of, shift in zip(strips, scanner.shifts.values(), strict=True):
-            near, poses = _near(of, xy, scanner.boresight, shift, settings)
+            near, poses = _near(*of, path, xy, scanner, shift, settings)
             grid = index_cloud(near)
             heights = heights_at(grid, xy, method, settings)
             # Tangent plane; the height error is projected onto its normal.
@@ -193,38 +190,28 @@ def simultaneous(
     )  # fmt: skip
 
 
-def _strips(cloud: Cloud, names: tuple[str, ...], path: ScannerPath | None) -> list[_Strip]:
-    """Split the cloud by strip."""
-    strips = []
-    for k, name in enumerate(names):
-        returns = cloud if cloud.strip is None else cloud.take(np.flatnonzero(cloud.strip == k))
-        if not len(returns):
-            raise InputError(f"strip {name} of the cloud has no points: omit it, or read other classes and returns")
-        strips.append(_Strip(returns, index_cloud(returns.xyz), path))
-    return strips
-
-
 def _near(
-    strip: _Strip,
+    strip: Cloud,
+    grid: Grid,
+    path: ScannerPath | None,
     xy: Float[np.ndarray, "n 2"],
-    boresight: Float[ArrayLike, "3"],
+    scanner: Scanner,
     shift: Float[ArrayLike, "3"],
     settings: HeightSettings,
 ) -> tuple[Cloud, ScannerPoses | None]:
     """Return the corrected laser points that can affect the surface at some positions, and their scanner poses."""
 
     def corrected(index: Int[np.ndarray, "m"]) -> tuple[Cloud, ScannerPoses | None]:
-        returns = strip.cloud.take(index)
-        timed = strip.path is not None and returns.time is not None
-        poses = scanner_poses(strip.path, returns.time) if timed else None  # type: ignore[arg-type]
-        return dataclasses.replace(returns, xyz=corrected_xyz(returns.xyz, poses, boresight, shift)), poses
+        returns = strip.take(index)
+        poses = None if path is None or returns.time is None else scanner_poses(path, returns.time)
+        return dataclasses.replace(returns, xyz=corrected_xyz(returns.xyz, poses, scanner.boresight, shift)), poses
 
-    order = np.asarray(strip.grid.order)
+    order = np.asarray(grid.order)
     # Positions in the measured cloud: remove the correction of the nearest laser point.
-    one = order[nearest(strip.grid, xy, 1).index[:, 0]]
-    offset = strip.cloud.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
-    enough = min(max(_NEAR, _TIMES * settings.points), len(strip.cloud))
-    return corrected(np.unique(order[nearest(strip.grid, xy + offset, enough).index]))
+    one = order[nearest(grid, xy, 1).index[:, 0]]
+    offset = strip.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
+    enough = min(max(_NEAR, _TIMES * settings.points), len(strip))
+    return corrected(np.unique(order[nearest(grid, xy + offset, enough).index]))
 
 
 def _turns(
