@@ -328,15 +328,6 @@ def returns_about(
     return index, point
 
 
-def windows_of_returns(index: Int[np.ndarray, "n"], point: Int[np.ndarray, "n"]) -> Float[np.ndarray, "points"]:
-    """Return the mean number of windows, from `returns_about`, that contain a return near each point.
-
-    Multiply variances of planes by it, so that returns shared by close points are counted once.
-    """
-    often = np.bincount(index)[index]
-    return np.bincount(point, often) / np.maximum(np.bincount(point), 1)
-
-
 def on_planes(patches: StripPatches, points: Float[np.ndarray, "points 3"]) -> PointsOnPlanes:
     """Match points with planes of a strip; `patches.cell` is the index of the point."""
     patch, place = np.arange(len(patches.cell)), points[patches.cell]

@@ -55,8 +55,6 @@ from jaxphoto.unknowns import FREE
 _ZERO = (0.0, 0.0, 0.0)
 # Default error of approximate positions at close range, divided by the shortest object distance.
 _NEAR = 0.02
-# Approximate interval (s) of nodes along a scanner strip.
-_NODES_S = 5.0
 
 
 class BiasTruthKeys(Keys):

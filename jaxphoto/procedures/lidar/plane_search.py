@@ -23,7 +23,6 @@ from jaxphoto.lidar.strip_planes import (
     on_planes,
     planes_of,
     returns_about,
-    windows_of_returns,
 )
 from jaxphoto.observations import StripPlanes, StripPoints
 from jaxphoto.procedures.lidar.strip_model import Look, looks_of, plane_rows, side_of, thinned
@@ -155,7 +154,9 @@ class PointSearch:
             measured, time = search.cloud.xyz[strip_look.returns], times_of(search.cloud)[strip_look.returns]
             patches = planes_of(xyz[index], measured[index], time[index], point, search.settings)
             found = on_planes(patches, place)
-            found = found._replace(sigma=found.sigma * np.sqrt(windows_of_returns(index, point)[found.point]))
+            # Mean number of windows of a return near each point: count returns shared by close points once.
+            windows = np.bincount(point, np.bincount(index)[index]) / np.maximum(np.bincount(point), 1)
+            found = found._replace(sigma=found.sigma * np.sqrt(windows[found.point]))
             of_points = np.einsum("ni,nij,nj->n", patches.normal, spread[found.point], patches.normal)
             sigma = np.sqrt(found.sigma**2 + of_points)
             seen.append(
