@@ -32,8 +32,6 @@ sys.path.insert(0, str(HERE.parent))
 
 # Of a run that goes on where it was stopped: pieces of a killed run are its own, and another call takes them up.
 _GOES_ON = {"monte-carlo"}
-# Of a command that writes new files only, and refuses where one is.
-_NEW_ONLY = {"dsm"}
 # Files whose bytes tell when they were made: seconds of the run.
 _TIMED = {"summary.json", "report.html", ".jaxphoto.json", "run.json", "orientation.json"}
 _FOLDER = "out"
@@ -117,7 +115,7 @@ class Tried:
         """Kill runs at random moments, every second of them over earlier results."""
         delays = self.rng.uniform(0.0, self.seconds, number)
         for k, delay in enumerate(delays.tolist()):
-            earlier = k % 2 == 1 and self.name not in _NEW_ONLY
+            earlier = k % 2 == 1
             if not earlier:
                 _remove(self.place / self.case.out)
             elif not (self.place / self.case.out).exists():
@@ -130,8 +128,6 @@ class Tried:
             yield from self.judged(self.place, f"killed after {delay:.3f} s", must_be=earlier)
         if number:
             # What was killed goes on, or begins again, and ends as if nothing had been.
-            if self.name in _NEW_ONLY:
-                _remove(self.place / self.case.out)
             code = _ended(self.start(self.place))
             if code not in (0, 1):
                 yield f"the run after the kills ends with exit code {code}"
@@ -301,7 +297,6 @@ def _cases(inputs: Path) -> dict[str, Case]:
     ground = sorted(str(path) for path in (inputs / "ground").iterdir())
     camera = ("--pixel-mm", "0.006", "--c-mm", "3.6")
     made = {
-        "dsm": Case((cloud, "--cell-m", "20"), "dsm.tif"),
         "simulate": Case((str(recipe),)),
         "adjust": Case((str(block),)),
         "lidar-control": Case((str(flight), cloud)),

@@ -14,7 +14,7 @@ import numpy as np
 from machine import forget_peak, machine, markdown, memory, run_here, sentence, write_results
 
 _DENSITY = 2.0  # points per square metre
-_METHODS = ("idw", "plane", "tin", "local")
+_METHODS = ("plane", "local")
 _NEIGHBOURS = 8
 _FEATURES = 10_000
 

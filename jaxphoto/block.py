@@ -84,8 +84,6 @@ class Block(BlockEdits):
     """
     converted_from: str = eqx.field(static=True, default="")
     """Format and file of another program from which it was converted; "" for none."""
-    breaklines: tuple[str, ...] = eqx.field(static=True, default=())
-    """Points measured at the intersection of two smooth faces, such as the ridge of a roof."""
 
     def __check_init__(self) -> None:
         for field, kind in (

@@ -4,8 +4,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 EXTRAS = {
-    "laspy": "lidar", "lazrs": "lidar", "rasterio": "lidar",
-    "cv2": "photos", "pycolmap": "photos",
+    "laspy": "lidar", "lazrs": "lidar",
+    "rasterio": "photos", "cv2": "photos", "pycolmap": "photos",
     "pyarrow": "parquet",
     "blackjax": "posterior",
 }  # fmt: skip

@@ -275,7 +275,6 @@ def _part(block: Block, image: np.ndarray, point: np.ndarray) -> Block:
         distances=kept(block.distances),
         more=tuple(kept(rows) if isinstance(rows, AbstractObservations) else rows for rows in block.more),
         partitions={name: tuple(of[i] for i in image) for name, of in block.partitions.items()},
-        breaklines=tuple(name for name in block.breaklines if name in set(points)),
         datum=datum,
         start=dataclasses.replace(
             old, unknowns=start, image_known=old.image_known[image], point_known=old.point_known[point]

@@ -178,32 +178,6 @@ def certificate(
     output.wrote(out, f"certificate in {out}")
 
 
-@command("tables", PANEL, f"{_ADJUSTED}jaxphoto tables results --to latex --only interior --out tables")
-def tables(
-    output: Output,
-    results: Annotated[Path, Argument(help="Result folder, for example of adjust.")],
-    to: Annotated[Literal["csv", "parquet", "markdown", "latex"], Option(help="Format.")],
-    out: Annotated[Path, Option(help="Output folder; earlier tables in it are replaced.")],
-    only: Annotated[str, Option(help="Tables, comma-separated, like interior,exterior (default: all).")] = "",
-) -> None:
-    """Write result tables as CSV, Parquet, Markdown or LaTeX, rounded to their standard deviations."""
-    from jaxphoto.io import read_result_tables
-    from jaxphoto.io.result_tables import read_summary, reservation
-    from jaxphoto.report import write_table
-    from jaxphoto.writing import check_folder, whole_folder
-
-    check_folder(out, results)
-    read = read_result_tables(results, opt.names(only))
-    with output.progress("writing") as progress, whole_folder(out) as work:
-        for number, (name, table) in enumerate(read.items()):
-            progress.steps("writing tables", number, len(read))
-            write_table(table, name, work, to)
-    if text := reservation(read_summary(results)):
-        output.warn(text)
-    output.wrote(out, f"{len(read)} tables in {out}")
-    output.add(tables=list(read))
-
-
 @command(
     "monte-carlo",
     PANEL,

@@ -1,16 +1,28 @@
 """Commands for point clouds."""
 
 import time
-from functools import partial
+import warnings
+from collections.abc import Callable, Collection, Sequence
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 import typer
-from typer import Argument, Option
+from typer import Option
 
 from jaxphoto_command import options as opt
 from jaxphoto_command.application import command
 from jaxphoto_command.output import Output, Progress
+
+if TYPE_CHECKING:
+    import numpy as np
+
+    from jaxphoto.block import Frame
+    from jaxphoto.cloud import Cloud
+    from jaxphoto.georeferencing import Trajectory
+    from jaxphoto.io.clouds import Placement
+    from jaxphoto.io.trajectory import Records
+    from jaxphoto.procedures.control import SurveyedPoints
+    from jaxphoto.procedures.lidar import ScannerPriors
 
 PANEL = "Lidar"
 _EXAMPLE = "jaxphoto example lidar && "
@@ -21,25 +33,14 @@ SigmaZ = Annotated[float, Option(callback=opt.positive, help="Standard deviation
 SigmaXY = Annotated[float, Option(help="Standard deviation of a laser point in X and in Y.")]
 Systematic = Annotated[float, Option(help="Standard deviation of an error common to all heights.")]
 MaxRounds = Annotated[int, Option(min=1, help="Maximum number of outer iterations (surface lookup, adjustment).")]
-Trajectory = Annotated[
+TrajectoryFile = Annotated[
     Path | None, Option(help="Trajectory of the scanner (docs/georeferencing.md), on the clock of the cloud.")
 ]
 TrajectoryShift = Annotated[float, Option(callback=opt.finite, help="Trajectory time minus point cloud time.")]
-ExposureShift = Annotated[float, Option(callback=opt.finite, help="Point cloud time minus time_s of images.csv.")]
-Control = Annotated[Path | None, Option(help="Surveyed points on smooth surfaces (docs/control.md).")]
-Breaklines = Annotated[
-    str | None, Option(help="Tie points on breaklines, comma-separated, * as wildcard (default: from block.toml).")
-]
-Pattern = Annotated[
-    Literal["line", "circle", "oscillating", "rotating", "risley", "nutating"] | None,
-    Option(help="Scan pattern (default: line)."),
-]
-CellSize = Annotated[float, Option(callback=opt.positive, help="Cell size of the plane search.")]
-Roughness = Annotated[float, Option(callback=opt.positive, help="Maximum scatter of the returns of a plane.")]
-KnotSpacing = Annotated[float, Option(callback=opt.positive, help="Knot spacing of the trajectory errors.")]
-# Options of `simultaneous` that apply only without, and only with --adjust.
-_SURFACE_OPTIONS = ("boresight", "shift", "method", "sigma_z_m", "sigma_xy_m", "sigma_systematic_m")
-_PLANE_OPTIONS = ("exposure_shift_s", "control", "breaklines", "pattern", "cell_m", "roughness_m", "knots_s")
+
+
+def _sigma(help: str) -> Any:
+    return Annotated[float | None, Option(callback=opt.positive, help=f"Standard deviation of {help}.")]
 
 
 @command("lidar-control", PANEL, f"{_EXAMPLE}jaxphoto lidar-control lidar lidar/cloud.laz --out with_heights")
@@ -49,7 +50,7 @@ def lidar_control(
     cloud: opt.Cloud,
     out: opt.BlockOut,
     method: Annotated[
-        Literal["plane", "local", "tin", "idw", "image"], Option(help="Interpolation of heights between laser points.")
+        Literal["plane", "local", "image"], Option(help="Interpolation of heights between laser points.")
     ] = "plane",
     sigma_z_m: SigmaZ = 0.15,
     sigma_xy_m: SigmaXY = 0.5,
@@ -57,7 +58,6 @@ def lidar_control(
     classes: opt.Classes = None,
     returns: opt.Returns = "all",
     cloud_epsg: opt.CloudEpsg = None,
-    cloud_unit: opt.CloudUnit = None,
     max_rounds: MaxRounds = 20,
 ) -> None:
     """Add the heights of laser points at tie points as control, and write the block."""
@@ -70,12 +70,11 @@ def lidar_control(
     from jaxphoto.report.lidar import heights_page, heights_table, rounds_table, rounds_words
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
-    selection = {"classes": opt.class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
     check_block_target(out, block, cloud)
     with output.progress("reading the block") as progress:
-        read, points = _block_and_cloud(block, cloud, selection, progress)
+        read, points = _block_and_cloud(block, cloud, opt.selection(classes, returns, cloud_epsg), progress)
         report = _report_rounds(progress)
-        result = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)  # type: ignore[arg-type]
+        result = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)
         progress.update(f"writing {out}")
         heights, rounds = heights_table(result), rounds_table(result.rounds)
         page = heights_page(result, output.command_record(block, cloud))
@@ -104,7 +103,6 @@ def roof_control(
     classes: opt.Classes = None,
     returns: opt.Returns = "all",
     cloud_epsg: opt.CloudEpsg = None,
-    cloud_unit: opt.CloudUnit = None,
     max_rounds: MaxRounds = 20,
 ) -> None:
     """Constrain tie points to roof planes, and roof centroids in X, Y and Z; write the block."""
@@ -115,10 +113,9 @@ def roof_control(
     from jaxphoto.report.lidar import rounds_words
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=0.0)
-    selection = {"classes": opt.class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
     check_block_target(out, block, cloud)
     with output.progress("reading the block") as progress:
-        read, points = _block_and_cloud(block, cloud, selection, progress)
+        read, points = _block_and_cloud(block, cloud, opt.selection(classes, returns, cloud_epsg), progress)
         options: dict[str, Any] = {"max_rounds": max_rounds, "report": _report_rounds(progress)}
         result = roof_control(read, points, settings, centroids=opt.names(centroids), **options)
         progress.update(f"writing {out}")
@@ -139,38 +136,23 @@ def simultaneous(
     block: opt.Block,
     cloud: opt.Cloud,
     out: opt.Out,
-    trajectory: Trajectory = None,
+    trajectory: TrajectoryFile = None,
     trajectory_shift_s: TrajectoryShift = 0.0,
     boresight: Annotated[
         str | None,
         Option(help="Boresight of the scanner: free (default with a trajectory), fixed, or its sigma in degrees."),
     ] = None,
     shift: Annotated[str, Option(help="Shift of each lidar strip: free, fixed, or its sigma in m.")] = "0.3",
-    method: Annotated[Literal["local", "plane", "tin", "idw"], Option(help="Surface model.")] = "local",
+    method: Annotated[Literal["local", "plane"], Option(help="Surface model.")] = "local",
     sigma_z_m: SigmaZ = 0.15,
     sigma_xy_m: SigmaXY = 0.5,
     sigma_systematic_m: Systematic = 0.0,
     classes: opt.Classes = None,
     returns: opt.Returns = "all",
     cloud_epsg: opt.CloudEpsg = None,
-    cloud_unit: opt.CloudUnit = None,
     max_rounds: MaxRounds = 20,
-    adjust: Annotated[
-        str | None,
-        Option(help="Parts of the system to estimate, comma-separated: scanner,trajectory,camera (docs/boresight.md)."),
-    ] = None,
-    exposure_shift_s: ExposureShift = 0.0,
-    control: Control = None,
-    breaklines: Breaklines = None,
-    pattern: Pattern = None,
-    cell_m: CellSize = 3.0,
-    roughness_m: Roughness = 0.06,
-    knots_s: KnotSpacing = 10.0,
 ) -> None:
     """Adjust a block and a point cloud together; write results, corrected cloud and corrected trajectory.
-
-    With --adjust, strips are also fitted to each other by planes in their overlaps. Individual scanner parameters may
-    replace scanner, as in jaxphoto strips. Parts that are not given are fixed.
 
     --class and --returns select the points of the surface; the whole cloud is corrected. Exit code 1: results written,
     but not converged.
@@ -182,37 +164,11 @@ def simultaneous(
     from jaxphoto.io.trajectory import trajectory_in, with_positions, write_moved
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.lidar.correction import correct_cloud, scanner_path
-    from jaxphoto.lidar.coverage import check_covered
-    from jaxphoto.lidar.strip_planes import StripSettings
     from jaxphoto.procedures.lidar import simultaneous
     from jaxphoto.report.formatting import to_rich
     from jaxphoto.report.lidar import moved_table, rounds_words, write_simultaneous
     from jaxphoto.writing import check_folder
-    from jaxphoto_command.strip_flight import (
-        StripChoices,
-        StripFiles,
-        adjust_flight,
-        cloud_records,
-        scanner_priors,
-        write_corrected,
-    )
 
-    _check_options(output, _PLANE_OPTIONS if adjust is None else _SURFACE_OPTIONS)
-    selected = opt.class_numbers(classes)
-    if adjust is not None:
-        free = _scanner_parameters(adjust, ("scanner", "trajectory", "camera"))
-        times = (trajectory_shift_s, block, exposure_shift_s)
-        files = StripFiles(cloud, trajectory, *times, selected, returns, cloud_epsg, cloud_unit, control, breaklines)
-        choices = StripChoices(
-            StripSettings(cell_m=cell_m, roughness_m=roughness_m, knots_s=knots_s),
-            set(),
-            scanner_priors({*free, "boresight"} if "scanner" in free else free, pattern),
-            [] if "trajectory" in free else "all",
-            "camera" not in free,
-            max_rounds,
-        )
-        adjust_flight(output, files, choices, out)
-        return
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
     if trajectory is None and boresight not in (None, "fixed"):
         raise typer.BadParameter(f"--boresight {boresight} needs --trajectory.")
@@ -224,14 +180,11 @@ def simultaneous(
         read = read_block(block)
         records = path = None
         if trajectory is not None:
-            records = cloud_records(trajectory, trajectory_shift_s)
+            records = _cloud_records(trajectory, trajectory_shift_s)
             exact = np.zeros((len(records.time), 3))
             path = trajectory_in(records, read.frame, exact, exact)
         progress.update("reading the cloud")
-        system: dict[str, Any] = {"epsg": cloud_epsg, "unit": cloud_unit}
-        surface = clouds.read_cloud(cloud, read.frame, classes=selected, returns=returns, **system)
-        if path is not None:
-            check_covered(surface, path, trajectory_shift_s)
+        surface = clouds.read_cloud(cloud, read.frame, **opt.selection(classes, returns, cloud_epsg))
         seconds = {"read": time.perf_counter() - start}
         priors = Scanner(rotation, dict.fromkeys(surface.strips or ("cloud",), translation))
         report = _report_rounds(progress)
@@ -242,7 +195,7 @@ def simultaneous(
         with write_simultaneous(result, out, seconds, output.command_record(block, cloud, trajectory)) as folder:
             strips = tuple(result.scanner.shifts)
             corrected = lambda part: correct_cloud(part, result.scanner, track).xyz  # noqa: E731
-            write_corrected(cloud, folder, corrected, strips, path, read.frame, system)
+            write_corrected(cloud, folder, corrected, strips, path, read.frame, cloud_epsg)
             if trajectory is not None and records is not None and result.trajectory is not None:
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 write_moved(moved._replace(time=moved.time + trajectory_shift_s), trajectory, folder)
@@ -263,7 +216,7 @@ def strips(
     output: Output,
     cloud: opt.Cloud,
     out: opt.Out,
-    trajectory: Trajectory = None,
+    trajectory: TrajectoryFile = None,
     trajectory_shift_s: TrajectoryShift = 0.0,
     adjust: Annotated[
         str | None,
@@ -271,45 +224,34 @@ def strips(
             help=f"Scanner parameters to estimate, comma-separated: {', '.join(SCANNER)}; or none (default: boresight)."
         ),
     ] = None,
-    pattern: Pattern = None,
+    pattern: Annotated[
+        Literal["line", "circle"] | None, Option(help="Scan pattern on the ground (default: line).")
+    ] = None,
     block: Annotated[
         Path | None, Option(help="Block folder of photographs on this trajectory, to adjust with the strips.")
     ] = None,
-    exposure_shift_s: ExposureShift = 0.0,
-    control: Control = None,
-    breaklines: Breaklines = None,
+    exposure_shift_s: Annotated[
+        float, Option(callback=opt.finite, help="Point cloud time minus time_s of images.csv.")
+    ] = 0.0,
+    control: Annotated[Path | None, Option(help="Surveyed points on smooth surfaces (docs/control.md).")] = None,
     hold: Annotated[str, Option(help="Strips with a fixed trajectory, comma-separated.")] = "",
-    cell_m: CellSize = 3.0,
-    roughness_m: Roughness = 0.06,
+    cell_m: Annotated[float, Option(callback=opt.positive, help="Cell size of the plane search.")] = 3.0,
+    roughness_m: Annotated[
+        float, Option(callback=opt.positive, help="Maximum scatter of the returns of a plane.")
+    ] = 0.06,
     most_planes: Annotated[int, Option(min=1, help="Maximum number of observed planes.")] = 4000,
-    knots_s: KnotSpacing = 10.0,
+    knots_s: Annotated[float, Option(callback=opt.positive, help="Knot spacing of the trajectory errors.")] = 10.0,
     correlation_s: Annotated[
         float, Option(callback=opt.positive, help="Correlation time of the trajectory errors.")
     ] = 100.0,
-    sigma_position_m: Annotated[
-        float | None,
-        Option(callback=opt.positive, help="Standard deviation of positions (default: from the trajectory, or 0.08)."),
-    ] = None,
-    sigma_attitude_deg: Annotated[
-        float | None,
-        Option(
-            callback=opt.positive, help="Standard deviation of roll, pitch (default: from the trajectory, or 0.005)."
-        ),
-    ] = None,
-    sigma_heading_deg: Annotated[
-        float | None,
-        Option(callback=opt.positive, help="Standard deviation of heading (default: from the trajectory, or 0.01)."),
-    ] = None,
-    sigma_exposure_m: Annotated[
-        float, Option(callback=opt.positive, help="Additional standard deviation of exposure positions.")
-    ] = 0.01,
-    sigma_exposure_deg: Annotated[
-        float, Option(callback=opt.positive, help="Additional standard deviation of exposure attitudes.")
-    ] = 0.002,
+    sigma_position_m: _sigma("positions (default: from the trajectory, or 0.08)") = None,  # type: ignore[valid-type]
+    sigma_attitude_deg: _sigma("roll, pitch (default: from the trajectory, or 0.005)") = None,  # type: ignore[valid-type]
+    sigma_heading_deg: _sigma("heading (default: from the trajectory, or 0.01)") = None,  # type: ignore[valid-type]
+    sigma_exposure_m: _sigma("exposure positions, in addition") = 0.01,  # type: ignore[valid-type]
+    sigma_exposure_deg: _sigma("exposure attitudes, in addition") = 0.002,  # type: ignore[valid-type]
     classes: opt.Classes = None,
     returns: opt.Returns = "all",
     cloud_epsg: opt.CloudEpsg = None,
-    cloud_unit: opt.CloudUnit = None,
     max_rounds: MaxRounds = 10,
 ) -> None:
     """Fit the strips of a point cloud to each other; write errors, corrected cloud and corrected trajectory.
@@ -320,8 +262,20 @@ def strips(
     --class and --returns select the points of the planes; the whole cloud is corrected. Exit code 1: results written,
     but the verdict is red, or not converged.
     """
-    from jaxphoto.lidar.strip_planes import StripSettings
-    from jaxphoto_command.strip_flight import StripChoices, StripFiles, adjust_flight, scanner_priors
+    import numpy as np
+
+    from jaxphoto.block import Frame
+    from jaxphoto.io import clouds, read_block, write_block
+    from jaxphoto.io.block_folder import exposure_times
+    from jaxphoto.io.trajectory import trajectory_in, with_poses, write_moved
+    from jaxphoto.lidar.correction import correct_strips, scanner_path
+    from jaxphoto.lidar.strip_planes import StripSettings, strip_differences
+    from jaxphoto.procedures.lidar import Photographs, StripRound, adjust_strips
+    from jaxphoto.procedures.lidar.iterate_to_convergence import at_result
+    from jaxphoto.report.strips import print_strips, strips_verdict, write_strips
+    from jaxphoto.report.tables import Tables
+    from jaxphoto.report.terminal import print_verdict
+    from jaxphoto.writing import check_folder
 
     sigmas = {
         "sigma_position_m": sigma_position_m,
@@ -330,165 +284,193 @@ def strips(
     }
     stated: dict[str, Any] = {name: sigma for name, sigma in sigmas.items() if sigma is not None}
     settings = StripSettings(
-        cell_m=cell_m,
-        roughness_m=roughness_m,
-        most=most_planes,
-        knots_s=knots_s,
-        correlation_s=correlation_s,
-        sigma_exposure_m=sigma_exposure_m,
-        sigma_exposure_deg=sigma_exposure_deg,
-        **stated,
-    )
-    files = StripFiles(
-        cloud,
-        trajectory,
-        trajectory_shift_s,
-        block,
-        exposure_shift_s,
-        opt.class_numbers(classes),
-        returns,
-        cloud_epsg,
-        cloud_unit,
-        control,
-        breaklines,
-    )
+        cell_m=cell_m, roughness_m=roughness_m, most=most_planes, knots_s=knots_s, correlation_s=correlation_s,
+        sigma_exposure_m=sigma_exposure_m, sigma_exposure_deg=sigma_exposure_deg, **stated,
+    )  # fmt: skip
     priors = None
     if adjust is not None or pattern is not None:
-        free = set() if adjust == "none" else _scanner_parameters(adjust or "boresight")
+        free = set() if adjust == "none" else set(opt.names(adjust or "boresight")) or {","}
+        for name in free - set(SCANNER):
+            raise typer.BadParameter(f"--adjust {name!r}: choose from {', '.join(SCANNER)}.")
         priors = scanner_priors(free, pattern)
-    adjust_flight(output, files, StripChoices(settings, set(stated), priors, opt.names(hold), False, max_rounds), out)
-
-
-@command("dsm", PANEL, f"{_EXAMPLE}jaxphoto dsm lidar/cloud.laz --out dsm.tif --cell-m 4 --hillshade hill.png")
-def dsm(
-    output: Output,
-    cloud: opt.Cloud,
-    out: Annotated[Path, Option(help="GeoTIFF to write.")],
-    cell_m: Annotated[float, Option(callback=opt.positive, help="Cell size.")] = 1.0,
-    classes: opt.Classes = None,
-    returns: opt.Returns = "all",
-    statistic: Annotated[
-        Literal["highest", "mean", "lowest"], Option(help="Statistic of the heights in a cell.")
-    ] = "highest",
-    fill_m: Annotated[float, Option(min=0.0, help="Fill gaps up to this distance from a height.")] = 0.0,
-    cloud_epsg: opt.CloudEpsg = None,
-    cloud_unit: opt.CloudUnit = None,
-    shading: Annotated[Path | None, Option("--hillshade", help="PNG of the shaded surface to write.")] = None,
-) -> None:
-    """Compute a surface model from a point cloud."""
-    import numpy as np
-
-    from jaxphoto.io import clouds, raster
-    from jaxphoto.lidar.raster import filled, hillshade, surface_model
-    from jaxphoto.writing import check_file
-
-    check_file(out, cloud)
-    if shading is not None:
-        check_file(shading, cloud, out)
-    selected, options = opt.class_numbers(classes), {"epsg": cloud_epsg, "unit": cloud_unit}
+    check_folder(out, cloud, *(path for path in (trajectory, block, control) if path is not None))
     with output.progress("reading the cloud") as progress:
-        system = clouds.cloud_system(cloud, **options)  # type: ignore[arg-type]
-        # Headers are rounded: add one cell on each side, and remove it if empty.
-        extent = clouds.extent(cloud, **options)[:, :2] + np.array([[-cell_m], [cell_m]])  # type: ignore[arg-type]
-        parts = partial(clouds.cloud_chunks, cloud, classes=selected, returns=returns, **options)  # type: ignore[arg-type]
-        total = clouds.point_count(cloud) if selected is None and returns == "all" else None
-        points = progress.points("reading the cloud", parts, total)
-        surface = filled(surface_model((part.xyz for part in points()), extent, cell_m, statistic), fill_m)
+        photographs, frame, records, path = None, None, None, None
+        if block is not None:
+            read = read_block(block)
+            photographs, frame = Photographs(read, exposure_times(block) + exposure_shift_s), read.frame
+        if trajectory is not None:
+            records = _cloud_records(trajectory, trajectory_shift_s)
+            if records.geographic and frame is None:
+                frame = _frame_at(records, cloud, cloud_epsg)
+            # Standard deviations that are unknown or overridden are zero; roll, pitch, yaw.
+            kept = [name not in stated for name in ("sigma_attitude_deg", "sigma_attitude_deg", "sigma_heading_deg")]
+            sigma_m = np.nan_to_num(records.sigma_m) * ("sigma_position_m" not in stated)
+            sigma_rad = np.deg2rad(np.nan_to_num(records.sigma_deg) * kept)
+            path = trajectory_in(records, frame or Frame(), sigma_m, sigma_rad)
+        surveyed = None
+        if control is not None:
+            surveyed = _control_in_frame(control, clouds.cloud_placement(cloud, frame, cloud_epsg))
+        measured = clouds.read_cloud(cloud, frame, **opt.selection(classes, returns, cloud_epsg))
+
+        def report(iteration: StripRound) -> None:
+            before = f", rms difference of strips {iteration.rms_m:.3f} m before" if iteration.planes else ""
+            line = f"iteration {iteration.number}: {iteration.planes} planes{before}"
+            progress.update(f"{line}; largest change {iteration.largest_change:.2g} standard deviations")
+
+        progress.update("adjusting for the first iteration")
+        result = adjust_strips(
+            measured, path, settings, priors, photographs=photographs, control=surveyed, fixed=opt.names(hold),
+            max_rounds=max_rounds, report=report,
+        )  # fmt: skip
         progress.update(f"writing {out}")
-        raster.write_dsm(out, surface, system)
-        if shading is not None:
-            raster.write_hillshade(shading, hillshade(surface))
-    rows, columns = surface.heights.shape
-    fraction = 1 - np.isnan(surface.heights).mean()
-    low, high = np.nanmin(surface.heights), np.nanmax(surface.heights)
-    output.wrote(
-        out,
-        f"wrote {out}: {columns} x {rows} cells of {cell_m:g} m, {100 * fraction:.0f} % with heights, {low:.2f} to "
-        f"{high:.2f} m, in {system.name}",
-    )
-    if shading is not None:
-        output.wrote(shading, f"wrote {shading}")
-    output.add(columns=columns, rows=rows, cell_m=cell_m, part_with_heights=fraction, low_m=low, high_m=high)
-    output.add(system=system.name)
+        tables = None if photographs is None else Tables(result.adjusted, known=result.covariance)
+        verdict = strips_verdict(result, tables)
+        track = None if path is None else scanner_path(path)
+
+        def write_files(folder: Path) -> None:
+            corrected = lambda part: correct_strips(part, result.errors, track).xyz  # noqa: E731
+            write_corrected(cloud, folder, corrected, result.cloud.strips, path, frame, cloud_epsg)
+            if trajectory is not None and records is not None and result.trajectory is not None:
+                moved = with_poses(records, result.trajectory, frame or Frame())
+                write_moved(moved._replace(time=moved.time + trajectory_shift_s), trajectory, folder)
+            if photographs is not None:
+                write_block(at_result(result.adjusted.block, result.adjusted.unknowns), folder / "block")
+
+        gaps = strip_differences(measured, settings), strip_differences(result.cloud, settings)
+        record = output.command_record(cloud, trajectory, block, control)
+        write_strips(result, tables, verdict, gaps, out, write_files, record)
+    print_verdict(verdict, output.screen)
+    print_strips(result, output.screen)
+    output.wrote(out, f"results in {out} (open report.html)")
+    if verdict.severity == "error":
+        raise typer.Exit(1)
 
 
-@command("orthophoto", PANEL, "jaxphoto orthophoto BLOCK photo.jpg dsm.tif --image A1 --out ortho.tif")
-def orthophoto(
-    output: Output,
-    block: opt.Block,
-    photo: Annotated[Path, Argument(help="Photograph of the image.")],
-    dsm: Annotated[Path, Argument(help="Surface model.")],
-    image: Annotated[str, Option(help="Id of the image in the block.")],
-    out: Annotated[Path, Option(help="GeoTIFF to write.")],
-    dsm_epsg: Annotated[int | None, Option(help="EPSG code of the surface model, if not in the file.")] = None,
-    max_steps: opt.MaxSteps = 100,
+def scanner_priors(free: Collection[str], pattern: str | None) -> "ScannerPriors":
+    """Return priors with the scanner parameters `free` FREE and all others FIXED."""
+    from jaxphoto.georeferencing import ScannerCalibration
+    from jaxphoto.procedures.lidar import ScannerPriors
+    from jaxphoto.unknowns import FIXED, FREE
+
+    boresight, *calibration = (FREE if name in free else FIXED for name in SCANNER)
+    return ScannerPriors(boresight, ScannerCalibration(*calibration, pattern or "line"))  # type: ignore[arg-type, call-arg]
+
+
+def write_corrected(
+    cloud: Path,
+    folder: Path,
+    corrected: "Callable[[Cloud], np.ndarray]",
+    strips: Sequence[str],
+    trajectory: "Trajectory | None",
+    frame: "Frame | None",
+    epsg: int | None = None,
 ) -> None:
-    """Adjust a block and project the photograph of one image onto a surface model."""
-    import jax
+    """Write `cloud` with the coordinates `corrected` of each part; strips are numbered as in `strips`.
+
+    Withheld points of other strips, or at times without trajectory, are not corrected; a UserWarning contains their
+    number. Raises InputError for other points of other strips.
+    """
     import numpy as np
 
-    from jaxphoto.errors import BlockError, InputError
-    from jaxphoto.io import clouds, raster, read_block
-    from jaxphoto.lidar.raster import orthophoto
-    from jaxphoto.procedures.adjust import adjust
-    from jaxphoto.writing import check_file
+    from jaxphoto.errors import InputError, counted
+    from jaxphoto.io import clouds
+    from jaxphoto.lidar.correction import covers
 
-    check_file(out, block, photo, dsm)
-    with output.progress("reading") as progress:
-        read = read_block(block)
-        if image not in read.images:
-            some = ", ".join(read.images[:5]) + (" ..." if len(read.images) > 5 else "")
-            raise InputError(f"--image {image}: unknown image; use one of {some}")
-        index = read.images.index(image)
-        camera = read.image_camera[index]
-        surface, system = raster.read_dsm(dsm, dsm_epsg)
-        placement = clouds.Placement(dsm.name, system, read.frame, "--dsm-epsg")
-        pixels = raster.read_photograph(photo, read.sensors[camera])
-        progress.update("adjusting")
-        adjusted = adjust(read, max_steps=max_steps)
-        if not bool(adjusted.converged):
-            raise BlockError(f"{adjusted.outcome.value}: an orthophoto needs an adjusted orientation")
-        progress.update("resampling")
-        exterior = jax.tree.map(lambda v: np.asarray(v)[index], adjusted.unknowns.exterior)
-        picture = orthophoto(
-            surface,
-            pixels,
-            read.sensors[camera],
-            adjusted.unknowns.interior[camera],
-            exterior,
-            object_from_map=placement.frame_from_metres,
-            map_from_object=placement.metres,
-            corrections=read.corrections,
-        )
-        if not picture.seen.any():
-            (west, south), (east, north) = surface.extent
-            x, y, z = placement.metres(np.asarray(exterior.position)[None])[0]
+    def moved(part: "Cloud") -> np.ndarray:
+        part = part.numbered(strips)
+        usable = np.isfinite(part.xyz).all(axis=1)
+        if part.strip is not None and part.strips:
+            usable &= part.strip < len(strips)
+        if trajectory is not None and part.time is not None and part.withheld is not None:
+            usable &= ~part.withheld | covers(trajectory, part.time)
+        used = usable if part.withheld is None else usable | ~part.withheld
+        for k in part.strip[used & ~usable][:1] if part.strip is not None else ():
             raise InputError(
-                f"image {image}, from ({x:.1f}, {y:.1f}, {z:.1f}) m, does not see {dsm.name} (X {west:.1f} to "
-                f"{east:.1f}, Y {south:.1f} to {north:.1f} m, Z {np.nanmin(surface.heights):.1f} to "
-                f"{np.nanmax(surface.heights):.1f} m); give a surface model of this area"
+                f"strip {part.strips[k]} has no points of these classes and returns: choose others, or remove the strip"
             )
-        raster.write_orthophoto(out, picture, surface, system)
-    fraction = picture.seen.mean()
-    output.wrote(out, f"wrote {out}: image {image} on {100 * fraction:.0f} % of the cells of {dsm.name}")
-    output.add(image=image, part_seen=fraction)
+        xyz = np.full(part.xyz.shape, np.nan)
+        xyz[used] = corrected(part.take(used))
+        return xyz
+
+    name = cloud.name if cloud.suffix.lower() in (".las", ".laz") else f"corrected_{cloud.name}"
+    uncorrected = clouds.rewrite_cloud(cloud, folder / name, moved, frame=frame, epsg=epsg)
+    if uncorrected:
+        warnings.warn(
+            f"{cloud.name}: {counted(uncorrected, 'point')} marked as withheld cannot be corrected (strip without "
+            "others, no trajectory records, or outside the coordinate system) and are unchanged",
+            stacklevel=2,
+        )
 
 
-def _check_options(output: Output, options: tuple[str, ...]) -> None:
-    """Raise BadParameter for options that have no effect with --adjust, or need it."""
-    defaults = {parameter.name: parameter.default for parameter in output.context.command.params}
-    for name in options:
-        if output.context.params[name] != defaults[name]:
-            cure = "needs --adjust" if options is _PLANE_OPTIONS else "has no effect with --adjust: omit one of them"
-            raise typer.BadParameter(f"--{name.replace('_', '-')} {cure}.")
+def _cloud_records(trajectory: Path, shift_s: float) -> "Records":
+    """Read a trajectory and convert its times to the clock of the cloud."""
+    from jaxphoto.io.trajectory import read_records
+
+    records = read_records(trajectory)
+    return records._replace(time=records.time - shift_s)
 
 
-def _scanner_parameters(text: str, others: tuple[str, ...] = ()) -> set[str]:
-    """Split comma-separated scanner parameters, or names of `others`. Raises BadParameter for an unknown name."""
-    for name in opt.names(text) or [""]:
-        if name not in (*others, *SCANNER):
-            raise typer.BadParameter(f"--adjust {name or repr(text)}: choose from {', '.join((*others, *SCANNER))}.")
-    return set(opt.names(text))
+def _frame_at(records: "Records", cloud: Path, epsg: int | None) -> "Frame":
+    """Return a local frame at the middle of a geographic trajectory."""
+    from jaxphoto.block import Frame
+    from jaxphoto.errors import InputError
+    from jaxphoto.io import clouds
+
+    # Any system of the same datum suffices: points are transformed from their own system.
+    crs = clouds.cloud_system(cloud, epsg)
+    datum = None if crs is None else crs.geodetic_crs
+    code = None if datum is None else datum.to_2d().to_epsg()
+    if code is None:
+        raise InputError(
+            f"{records.file}: the trajectory is in longitude and latitude, and {cloud.name} has no EPSG code; give it "
+            "(--cloud-epsg)"
+        )
+    longitude, latitude, height = records.coordinates[len(records.time) // 2].tolist()
+    return Frame("epsg", code, origin=(longitude, latitude, height))
+
+
+def _control_in_frame(path: Path, placement: "Placement") -> "SurveyedPoints":
+    """Read surveyed points in the coordinate system of the cloud, in metres, and transform them to its frame.
+
+    Raises InputError for points in a different system, without heights or sigmas, or outside the system. Warns that
+    image measurements are not used.
+    """
+    import numpy as np
+
+    from jaxphoto.errors import InputError
+    from jaxphoto.extras.formats import read_control
+    from jaxphoto.procedures.control.surveyed import system_of
+    from jaxphoto.procedures.lidar.strip_control import check_complete
+
+    points, marks = read_control(path)
+    if len(marks.image):
+        warnings.warn(
+            f"{points.file}: its {len(marks.image)} image measurements are not used: add them to the block",
+            UserWarning,
+            stacklevel=2,
+        )
+    plane, heights = placement.plane, placement.vertical
+    if points.system:
+        stated = system_of(points.system, points.file)
+        other = stated.crs is not None and plane is not None and not plane.equals(stated.crs, ignore_axis_order=True)
+        above = stated.vertical is not None and isinstance(heights, int) and heights != stated.vertical
+        if other or above or (stated.crs is None) != (plane is None):
+            raise InputError(
+                f"{points.file} is in {stated.name}, and {placement.name} in {placement.system}: give the control in "
+                "the system of the cloud"
+            )
+    check_complete(points)
+    xyz = points.coordinates
+    if points.own_axes and plane is not None and plane.axis_info[0].direction == "north":
+        xyz = xyz[:, [1, 0, 2]]
+    placed = placement.frame(xyz / placement.factors)
+    for k in np.flatnonzero(~np.isfinite(placed).all(axis=1)):
+        raise InputError(
+            f"{points.places[k]}: point {points.ids[k]} lies outside {placement.system}; correct its coordinates, "
+            "easting first, or give the control in the system of the cloud"
+        )
+    return points._replace(coordinates=placed)
 
 
 def _prior(option: str, text: str, unit: float) -> Any:

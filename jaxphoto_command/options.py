@@ -96,19 +96,15 @@ Targets = Annotated[
     Option(help="Targets to find at the points: circle:diameter_mm=300, aruco:dictionary=4X4_50, cross:side_mm=600."),
 ]
 
-Cloud = Annotated[Path, Argument(help="Point cloud: .las, .laz, .csv or .ply (docs/clouds.md).")]
+Cloud = Annotated[Path, Argument(help="Point cloud: .las, .laz or .csv (docs/clouds.md).")]
 Classes = Annotated[str | None, Option("--class", help="Classes to use, comma-separated: 2,6.")]
 Returns = Annotated[Literal["all", "first", "last", "only"], Option(help="Returns to use.")]
 CloudEpsg = Annotated[int | None, Option(help="EPSG code of the point cloud; overrides the file.")]
-CloudUnit = Annotated[
-    Literal["m", "ft", "us_ft"] | None, Option(help="Linear unit of the point cloud; overrides the file.")
-]
 
 
-def class_numbers(text: str | None) -> list[int] | None:
-    """Parse the classes of --class; None for all."""
-    if text is None:
-        return None
-    if not all(part.isdigit() for part in names(text)):
-        raise typer.BadParameter(f"--class {text}: give class numbers, comma-separated, like 2,6.")
-    return [int(part) for part in names(text)]
+def selection(classes: str | None, returns: str, epsg: int | None) -> dict[str, Any]:
+    """Return the options of `read_cloud`; raises BadParameter for classes that are not numbers."""
+    if classes is not None and not all(part.isdigit() for part in names(classes)):
+        raise typer.BadParameter(f"--class {classes}: give class numbers, comma-separated, like 2,6.")
+    numbers = None if classes is None else [int(part) for part in names(classes)]
+    return {"classes": numbers, "returns": returns, "epsg": epsg}

@@ -6,7 +6,7 @@ import shlex
 import time
 import warnings
 from collections import defaultdict
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -41,19 +41,6 @@ class Progress:
         if description != self._description:
             self._start(description, total)
         self._bar.update(self._task, completed=done)
-
-    def points(self, description: str, parts: Callable[[], Iterator], total: int | None) -> Callable[[], Iterator]:
-        """Return an iterator over `parts` of a point cloud that reports the number of points read."""
-
-        def counted() -> Iterator:
-            done = 0
-            self.update(description)
-            for part in parts():
-                done += len(part)
-                self.steps(f"{description} (points)", done, total)
-                yield part
-
-        return counted
 
     def _start(self, description: str, total: int | None) -> None:
         self._bar.remove_task(self._task)

@@ -44,7 +44,7 @@ def test_commands_without_an_extra_start():
     (rows,) = re.findall(r"^\| extra \|.*\n((?:\|.*\n)+)", PAGE, re.MULTILINE)
     commands = get_command(app).commands
     named = {name for name in re.findall(r"`([a-z-]+)`", rows) if name in commands}
-    assert {"fly", "dsm", "monte-carlo"} <= named
+    assert {"fly", "strips", "monte-carlo"} <= named
     functions = [inspect.unwrap(command.callback) for name, command in commands.items() if name not in named]
     done = without_extras("\n".join(line for function in functions for line in imports(function)))
     assert done.returncode == 0, done.stderr
@@ -58,8 +58,7 @@ def test_commands_without_an_extra_start():
             "cv2",
             "photos",
         ),
-        pytest.param("import jaxphoto.io.raster", "rasterio", "lidar", marks=pytest.mark.slow),
-        pytest.param("import jaxphoto.io.clouds.las", "laspy", "lidar", marks=pytest.mark.slow),
+        pytest.param("from jaxphoto.io import clouds; clouds._laspy()", "laspy", "lidar", marks=pytest.mark.slow),
     ],
 )
 def test_a_missing_extra_is_named_with_the_line_that_installs_it(program, module, extra):

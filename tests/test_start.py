@@ -14,21 +14,19 @@ from typer.main import get_command
 from jaxphoto.camera.undistortion import Keep
 from jaxphoto.extras.formats import CAMERAS_WRITTEN, LOSS_PX
 from jaxphoto.extras.photos.features import LONGEST_PX
-from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration
-from jaxphoto.io.clouds.cloud_reader import Returns
-from jaxphoto.io.clouds.coordinate_system import UNITS
+from jaxphoto.georeferencing import PATTERNS, ScannerCalibration
+from jaxphoto.io.clouds import Returns
 from jaxphoto.io.shipped import EXAMPLES
-from jaxphoto.lidar.raster import Statistic
+from jaxphoto.lidar.heights import Method
 from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.losses import LOSSES
 from jaxphoto.parameters import dynamic_fields
 from jaxphoto.procedures.compare import CUTS
-from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA, SURFACES
+from jaxphoto.procedures.lidar.images_and_cloud import SHIFT_SIGMA
 from jaxphoto.procedures.lidar.iterate_to_convergence import MAX_ROUNDS
 from jaxphoto.procedures.lidar.strip_adjustment import MAX_STRIP_ROUNDS
 from jaxphoto.procedures.lidar.vertical_control import METHODS
 from jaxphoto.procedures.model_choice import FOLDS
-from jaxphoto.report import TABLE_FORMATS
 from jaxphoto.sensitivity import PER
 from jaxphoto.sensitivity.influence import DELTA0, Per
 from jaxphoto.stability import METHODS as ALIGNMENTS
@@ -42,7 +40,6 @@ _STRIPS = StripSettings()
 CHOICES = [
     (blocks.adjust, "rotations", EOP_NAMES),
     (blocks.adjust, "robust", LOSSES),
-    (blocks.tables, "to", TABLE_FORMATS),
     (blocks.monte_carlo, "kind", [*PER, "noise"]),
     (blocks.sensitivity, "per", get_args(Per)),
     (blocks.halves, "method", ALIGNMENTS),
@@ -50,10 +47,8 @@ CHOICES = [
     (photographs.undistort, "keep", get_args(Keep)),
     (lidar.lidar_control, "method", METHODS),
     (lidar.lidar_control, "returns", get_args(Returns)),
-    (lidar.lidar_control, "cloud_unit", UNITS),
-    (lidar.simultaneous, "method", SURFACES),
-    (lidar.strips, "pattern", PATTERN_OF),
-    (lidar.dsm, "statistic", get_args(Statistic)),
+    (lidar.simultaneous, "method", get_args(Method)),
+    (lidar.strips, "pattern", PATTERNS),
 ]
 DEFAULTS = [
     (blocks.sensitivity, "delta0", DELTA0),

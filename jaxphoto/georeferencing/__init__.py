@@ -33,7 +33,6 @@ from jaxphoto.georeferencing.rig import RigCamera, in_rig, reference_later, rig_
 from jaxphoto.georeferencing.scan_strip_errors import StripErrors
 from jaxphoto.georeferencing.scanner import Scanner, corrected_point, raised_by_boresight
 from jaxphoto.georeferencing.scanner_calibration import (
-    PATTERN_OF,
     PATTERNS,
     Pattern,
     ScannerCalibration,
@@ -50,7 +49,7 @@ from jaxphoto.georeferencing.trajectory_knots import (
 )
 
 __all__ = [
-    "IMAGE_X", "NOMINAL", "PATTERNS", "PATTERN_OF", "Corrections", "DirectPartials", "Exposure", "FlightBias", "Mount",
+    "IMAGE_X", "NOMINAL", "PATTERNS", "Corrections", "DirectPartials", "Exposure", "FlightBias", "Mount",
     "Pattern", "Poses", "RayCovariance", "RigCamera", "Scanner", "ScannerCalibration", "SensorCovariance", "StripBias",
     "StripErrors", "StripSpline", "Surface", "Trajectory", "TrajectoryKnot", "TrajectorySpline", "apparent_point",
     "arm_to_camera", "attitude_residual", "body_from_camera", "corrected_point", "corrected_return", "corrected_shot",

@@ -39,14 +39,6 @@ from jaxphoto.rotation import rotate, small_rotation
 Pattern = Literal["line", "circle"]
 """Scan pattern on the ground: lines across track, or circular figures around the nadir."""
 PATTERNS: tuple[Pattern, ...] = get_args(Pattern)
-PATTERN_OF: dict[str, Pattern] = {
-    **{pattern: pattern for pattern in PATTERNS},
-    "oscillating": "line",
-    "rotating": "line",
-    "risley": "circle",
-    "nutating": "circle",
-}
-"""Pattern of each scanner type; the pattern names themselves are also valid."""
 _PPM = 1e-6
 _AXES = ("right", "forward", "up")
 

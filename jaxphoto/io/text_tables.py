@@ -4,12 +4,11 @@ Rows are numbered from 1, including header, comments and empty lines, as in a sp
 """
 
 import dataclasses
-import fnmatch
 import io
 import math
 import re
 import warnings
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -205,17 +204,6 @@ def _cells(path: Path, lines: list[str], rows: list[int], separator: str) -> pd.
     else:
         row, message = rows[quotation], "unpaired quotation marks; close or remove them in that row"
     raise RowError(f"{path.name}, row {row}: {message}", [row])
-
-
-def points_matching(points: Sequence[str], patterns: Iterable[str], where: str) -> tuple[str, ...]:
-    """Return the points that match `patterns` (* for any characters). Raises InputError for a pattern without match."""
-    matching: dict[str, None] = {}
-    for pattern in patterns:
-        names = [point for point in points if fnmatch.fnmatchcase(point, pattern)]
-        if not names:
-            raise InputError(f"{where} {pattern}: no point of the block has this name; correct it")
-        matching |= dict.fromkeys(names)
-    return tuple(matching)
 
 
 def finite(cell: str) -> float | None:

@@ -1,5 +1,6 @@
 """Resample photographs to a pinhole camera without distortion."""
 
+import warnings
 from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -13,8 +14,12 @@ from jaxphoto.camera.undistortion import Keep, Pinhole, pinhole, source_pixels
 from jaxphoto.errors import InputError
 from jaxphoto.io.camera_files import CAMERA, CameraFile, write_block_camera
 from jaxphoto.io.photographs import Photograph
-from jaxphoto.io.raster import read_photograph
+from jaxphoto.optional import extra
 from jaxphoto.writing import whole_folder
+
+with extra():
+    import rasterio
+    from rasterio.errors import NotGeoreferencedWarning, RasterioError
 
 # Pillow modes that can be resampled.
 _MODES = ("L", "RGB", "RGBA", "I;16")
@@ -71,8 +76,20 @@ def write_undistorted(
 
 def _read(path: Path, sensor: Sensor) -> tuple[np.ndarray, Image.Exif, dict[str, Any]]:
     """Read the pixels of a photograph (rows, columns, bands), its EXIF, and other metadata to retain."""
-    # Do not use Pillow's pixels: it rotates TIFFs by their orientation flag.
-    bands = read_photograph(path, sensor)
+    # Do not use the pixels of Pillow, which rotates TIFFs by their orientation flag.
+    try:
+        with warnings.catch_warnings(action="ignore", category=NotGeoreferencedWarning), rasterio.open(path) as file:
+            bands = file.read()
+    except RasterioError as error:
+        reason = (str(error).strip() or type(error).__name__).splitlines()[0][:100]
+        raise InputError(f"{path.name} cannot be read as a raster ({reason}); copy it again from its source") from None
+    height, width = bands.shape[1:]
+    if (width, height) != (sensor.width_px, sensor.height_px):
+        rotated = (height, width) == (sensor.width_px, sensor.height_px)
+        raise InputError(
+            f"{path.name} has {width} x {height} pixels, but its camera {sensor.width_px} x {sensor.height_px}; name "
+            f"{'the photograph before it was rotated' if rotated else 'another'}"
+        )
     with Image.open(path) as picture:
         if picture.mode not in _MODES:
             known = ", ".join(_MODES)

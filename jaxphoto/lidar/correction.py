@@ -1,4 +1,4 @@
-"""Correction of a cloud and its trajectory with the estimated scanner parameters."""
+"""Coverage of a cloud by a trajectory, and correction of both with the estimated scanner parameters."""
 
 import dataclasses
 from collections.abc import Callable
@@ -13,6 +13,7 @@ from jaxtyping import Array, Bool, Float
 from jaxphoto.arrays import ArrayLike
 from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import (
     Scanner,
     StripErrors,
@@ -22,13 +23,71 @@ from jaxphoto.georeferencing import (
     corrected_return,
     spline_through,
 )
-from jaxphoto.lidar.coverage import longest_interval, not_covered
+from jaxphoto.georeferencing.time_scales import looks_like, shift_that_fits
 from jaxphoto.rotation import matrix_from_quaternion, quaternion_from_matrix, small_rotation
 
 PORTION = 1 << 17
 """Number of laser points processed at a time, fitting the CPU cache; smaller portions are padded to a power of two."""
 # Minimum portion size: smaller ones take no time to compute, but each size would be compiled separately.
 _FEW = 1 << 11
+# Ratio of a record interval to the median interval above which it is a gap; one record may be missing.
+_GAP = 2.5
+
+
+def longest_interval(trajectory: Trajectory) -> float:
+    """Return the longest interval between two records (s) that is not a gap."""
+    return _GAP * float(np.median(np.diff(np.asarray(trajectory.time))))
+
+
+def covers(trajectory: Trajectory, time: Float[np.ndarray, "n"]) -> Bool[np.ndarray, "n"]:
+    """Return True for times (s) within the trajectory and outside its gaps."""
+    record = np.asarray(trajectory.time)
+    short = np.diff(record) <= longest_interval(trajectory)
+    # A record belongs to the intervals before and after it.
+    before, after = (
+        np.clip(np.searchsorted(record, time, side) - 1, 0, len(short) - 1)  # type: ignore[call-overload]
+        for side in ("left", "right")
+    )
+    return (time >= record[0]) & (time <= record[-1]) & (short[before] | short[after])
+
+
+def check_covered(cloud: Cloud, trajectory: Trajectory) -> None:
+    """Raise InputError or BlockError for laser points where `trajectory` has no records, or that have all one time."""
+    if cloud.time is None:
+        return
+    strip = np.zeros(len(cloud), int) if cloud.strip is None else cloud.strip
+    for k in np.unique(strip):
+        time, name = cloud.time[strip == k], f" of strip {cloud.strips[k]}" if len(cloud.strips) > 1 else ""
+        if len(time) > 1 and time.min() == time.max():
+            raise InputError(
+                f"all laser points{name} have one time, {time[0]:.3f} s, so their positions on the trajectory are "
+                "unknown: use a cloud with the GPS time of each point, or omit the trajectory"
+            )
+        if not covers(trajectory, time).all():
+            raise not_covered(trajectory, time, name)
+        # A strip with records missing in its middle consists of two flight lines.
+        inside = np.asarray(trajectory.time)
+        gap = np.flatnonzero(np.diff(inside) > longest_interval(trajectory))
+        split = gap[(inside[gap] > time.min()) & (inside[gap + 1] < time.max())]
+        for at in inside[split[:1]]:
+            raise BlockError(
+                f"laser points{name} lie before and after a gap of the trajectory at {at:.3f} s, as for two flight "
+                "lines with one point source ID: give each line its own ID, or use a trajectory without the gap"
+            )
+
+
+def not_covered(trajectory: Trajectory, time: Float[np.ndarray, "n"], of: str = "") -> BlockError:
+    """Return the error for times (s) of laser points outside the trajectory."""
+    record = np.asarray(trajectory.time)
+    shift = shift_that_fits(time, record[0], record[-1])
+    cure = f", or shift its clock (--trajectory-shift-s {shift:+.15g})" if shift is not None else ""
+    first = time[~covers(trajectory, time)].min()
+    clocks = (looks_like(times, "a start of its own") for times in (time, record))
+    return BlockError(
+        f"laser points{of} were measured where the trajectory has no records, first at {first:.3f} s: the cloud's "
+        f"clock shows {next(clocks)}, the trajectory's {next(clocks)}; "
+        f"give the trajectory of the whole flight, or the cloud without these points{cure}"
+    )
 
 
 class ScannerPoses(eqx.Module):
@@ -53,10 +112,7 @@ def scanner_path(trajectory: Trajectory) -> ScannerPath:
 
 
 def scanner_poses(path: ScannerPath, time: Float[np.ndarray, "n"]) -> ScannerPoses:
-    """Interpolate poses at the times of laser points (s).
-
-    Raises BlockError for times outside the trajectory.
-    """
+    """Interpolate poses at the times of laser points (s)."""
     if not len(time):
         return ScannerPoses(np.zeros((0, 3)), np.zeros((0, 3, 3)))
     position, turn, known = _along(_poses, path, time)
@@ -186,10 +242,7 @@ def corrected_strip(
     errors: StripErrors,
     path: ScannerPath | None,
 ) -> Float[np.ndarray, "n 3"]:
-    """Apply `georeferencing.corrected_return` to returns of one strip; without a path, only its constant shift.
-
-    Raises BlockError for times (s) outside the trajectory.
-    """
+    """Apply `georeferencing.corrected_return` to returns of one strip; without a path, only its constant shift."""
     if path is None:
         return xyz - errors.at(strip, time)[0]
     common = path.spline, errors.of_strip(strip), errors.boresight, errors.calibration

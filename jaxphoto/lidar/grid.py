@@ -22,14 +22,10 @@ _PER_CELL = 4
 _SAMPLE = 200_000
 # Fraction of the points beyond each border, if isolated points would make the grid too large.
 _OUTSIDE = 1e-3
-# Maximum number of query positions times candidates processed at a time.
-_AT_ONCE = 1_000_000
 # LAS classes of low, medium and high vegetation.
 _VEGETATION = (3, 4, 5)
 # LAS classes of ground, buildings, water and bridge decks.
 _SURFACES = (2, 6, 9, 17)
-# Maximum reach of a window; beyond it, a tree is searched.
-_REACH = 16
 
 
 class Grid(eqx.Module):
@@ -65,13 +61,11 @@ class Nearest(eqx.Module):
     """Horizontal distance (m)."""
 
 
-def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"], cell_m: float | None = None) -> Grid:
-    """Index a cloud, or an array of points (m), in square cells of side `cell_m`.
+def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"]) -> Grid:
+    """Index a cloud, or an array of points (m), in square cells.
 
-    By default a nonempty cell contains about 4 points. The number of cells is at most about twice the number of points:
+    A nonempty cell contains about 4 points. The number of cells is at most about twice the number of points:
     for larger areas, isolated points are assigned to the border of the grid, and cells are enlarged.
-
-    Raises InputError for a cloud without points or with NaN coordinates, and for a cell size that is not positive.
     """
     xyz = np.asarray(cloud.xyz if isinstance(cloud, Cloud) else cloud, float)
     if not len(xyz):
@@ -81,9 +75,7 @@ def index_cloud(cloud: Cloud | Float[np.ndarray, "n 3"], cell_m: float | None = 
         raise InputError(
             f"point {wrong} of the cloud is {xyz[wrong].tolist()}: remove points with NaN or infinite coordinates"
         )
-    if cell_m is not None and not (np.isfinite(cell_m) and cell_m > 0):
-        raise InputError(f"cell_m is {cell_m}; give a positive cell size in metres")
-    low, high, cell = _extent(xyz[:, :2], cell_m)
+    low, high, cell = _extent(xyz[:, :2])
     shape = np.maximum(np.ceil((high - low)[::-1] / cell), 1).astype(int)
     place = np.floor((xyz[:, :2] - low) / cell)
     place = np.clip(place, 0, shape[::-1] - 1).astype(np.int32)
@@ -132,32 +124,14 @@ def around(grid: Grid, xy: Float[Array, "2"], reach: int = 1) -> tuple[Int[Array
 
 
 def nearest(grid: Grid, xy: Float[np.ndarray, "places 2"], k: int) -> Nearest:
-    """Return the `k` points nearest to each position (m) in plan, exactly, nearest first.
-
-    Windows are enlarged until they contain the circle through the k-th point. Positions far from all points are
-    searched by a SciPy tree.
-    """
-    xy = np.asarray(xy, float).reshape(-1, 2)
-    index, distance = np.zeros((len(xy), k), np.int32), np.full((len(xy), k), np.inf)
-    reach = np.full(len(xy), _first_reach(k))
-    left = np.arange(len(xy))
-    while len(left):
-        far = left[reach[left] > _REACH]
-        if len(far):
-            distance[far], index[far] = _from_tree(grid, xy[far], k)
-        left = left[reach[left] <= _REACH]
-        begin, end, safe = _window(grid, xy[left], reach[left])
-        total = (end - begin).sum(axis=1)
-        by_total = np.argsort(total, kind="stable")
-        for some in _portions(total[by_total]):
-            of = by_total[some]
-            distance[left[of]], index[left[of]] = _nearest_of(grid, xy[left[of]], begin[of], end[of], k)
-        last = distance[left, -1]
-        # Enlarge to contain the circle through the current k-th point.
-        wanted = np.where(np.isfinite(last), np.ceil(last / float(grid.cell_m) + 1e-6), 2 * reach[left])
-        reach[left] = np.minimum(np.maximum(wanted, reach[left] + 1), _REACH + 1)
-        left = left[last > safe]
-    return Nearest(index, distance)
+    """Return the `k` points nearest to each position (m) in plan, exactly, nearest first."""
+    tree = getattr(grid, "_tree", None)
+    if tree is None:
+        # Points are sorted: an unbalanced tree is equally good, and faster to build. Keep it: searches repeat.
+        tree = scipy.spatial.KDTree(np.asarray(grid.xyz)[: len(grid), :2], balanced_tree=False, compact_nodes=False)
+        object.__setattr__(grid, "_tree", tree)
+    distance, index = tree.query(np.asarray(xy, float).reshape(-1, 2), k=np.arange(1, k + 1), workers=-1)
+    return Nearest(np.where(np.isfinite(distance), index, 0).astype(np.int32), distance)
 
 
 def _leafy(cloud: Cloud) -> np.ndarray:
@@ -173,12 +147,12 @@ def _leafy(cloud: Cloud) -> np.ndarray:
     return leafy
 
 
-def _extent(xy: np.ndarray, cell_m: float | None) -> tuple[np.ndarray, np.ndarray, float]:
+def _extent(xy: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
     """Return the lower left and upper right corner of the grid, and the side of its cells (m)."""
     low, high = xy.min(axis=0), xy.max(axis=0)
     some = xy[:: max(1, len(xy) // _SAMPLE)]
     limit = 2 * len(xy) + 1024
-    cell = cell_m or _cell_side(some, len(xy))
+    cell = _cell_side(some, len(xy))
     if _cells(low, high, cell) > limit:
         low, high = np.quantile(some, [_OUTSIDE, 1 - _OUTSIDE], axis=0)
     while _cells(low, high, cell) > limit:
@@ -218,64 +192,3 @@ def _room(n: int) -> int:
     """Round up `n` to one of eight sizes between two powers of two."""
     step = 1 << max(n.bit_length() - 4, 2)
     return -(-n // step) * step
-
-
-def _first_reach(k: int) -> int:
-    """Return the window size that contains at least `k` points in most cases."""
-    return max(1, int(np.ceil(np.sqrt(1.5 * k / (_PER_CELL * np.pi)))))
-
-
-def _window(grid: Grid, xy: np.ndarray, reach: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Return the runs of points of each position's window, and the radius (m) within which it is complete."""
-    rows, columns = (int(v) for v in grid.shape)
-    place = np.clip((xy - grid.corner) / grid.cell_m, 0, [columns, rows])
-    cell = np.minimum(np.floor(place).astype(int), [columns - 1, rows - 1])
-    widest = int(reach.max(initial=0))
-    step = np.arange(-widest, widest + 1)
-    row = cell[:, 1:] + step
-    inside = (row >= 0) & (row < rows) & (np.abs(step) <= reach[:, None])
-    left, right = cell[:, :1] - reach[:, None], cell[:, :1] + reach[:, None]
-    base = np.where(inside, row, 0) * columns
-    begin = np.where(inside, grid.start[base + np.maximum(left, 0)], 0)
-    end = np.where(inside, grid.start[base + np.minimum(right, columns - 1) + 1], 0)
-    # Points beyond the border are assigned to border cells.
-    low, high = cell - reach[:, None], cell + reach[:, None] + 1
-    sides = [np.where(low <= 0, np.inf, place - low), np.where(high >= [columns, rows], np.inf, high - place)]
-    return begin, end, np.min(np.concatenate(sides, axis=1), axis=1) * float(grid.cell_m)
-
-
-def _portions(total: np.ndarray) -> list[slice]:
-    """Split positions into portions with a limited number of candidates; `total` is ascending."""
-    portions, first = [], 0
-    while first < len(total):
-        many = max(1, int(np.searchsorted((np.arange(first, len(total)) - first + 1) * total[first:], _AT_ONCE)))
-        portions.append(slice(first, first + many))
-        first += many
-    return portions
-
-
-def _nearest_of(grid: Grid, xy: np.ndarray, begin: np.ndarray, end: np.ndarray, k: int):
-    """Return the distances of the nearest points among the runs, and their indices."""
-    length = end - begin
-    total = length.sum(axis=1)
-    ends = np.cumsum(length.ravel())
-    candidates = np.repeat(begin.ravel() - (ends - length.ravel()), length.ravel()) + np.arange(ends[-1])
-    there = np.arange(max(total.max(), k)) < total[:, None]
-    squared = np.full(there.shape, np.inf)
-    off = grid.xyz[candidates, :2] - np.repeat(xy, total, axis=0)
-    squared[there] = off[:, 0] ** 2 + off[:, 1] ** 2
-    index = np.zeros(there.shape, np.int32)
-    index[there] = candidates
-    if k < there.shape[1]:
-        some = np.argpartition(squared, k - 1, axis=1)[:, :k]
-        squared, index = np.take_along_axis(squared, some, axis=1), np.take_along_axis(index, some, axis=1)
-    by_distance = np.argsort(squared, axis=1)
-    index, squared = (np.take_along_axis(v, by_distance, axis=1) for v in (index, squared))
-    return np.sqrt(squared), index
-
-
-def _from_tree(grid: Grid, xy: np.ndarray, k: int):
-    # Points are sorted: an unbalanced tree is equally good, and faster to build.
-    tree = scipy.spatial.KDTree(grid.xyz[: len(grid), :2], balanced_tree=False, compact_nodes=False)
-    distance, index = tree.query(xy, k=np.arange(1, k + 1))
-    return distance, np.where(np.isfinite(distance), index, 0)

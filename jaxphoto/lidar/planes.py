@@ -226,30 +226,6 @@ def roof_centroid(points: Float[np.ndarray, "n 3"]) -> tuple[Float[np.ndarray, "
     return points.mean(axis=0), np.cov(points.T) / len(points)
 
 
-def ridge_line(first: Plane, second: Plane) -> tuple[Float[np.ndarray, "3"], Float[np.ndarray, "3"]]:
-    """Return the intersection line of two roof faces: a point (m) on it between them, and its unit direction.
-
-    Raises InputError for planes that are parallel within three standard deviations.
-    """
-    direction = np.cross(first.normal, second.normal)
-    length = np.linalg.norm(direction)
-    tilt = np.sqrt(np.trace(first.covariance[:3, :3]) + np.trace(second.covariance[:3, :3]))
-    if length < _CUT * tilt:
-        raise InputError(
-            "the two planes are parallel within their standard deviations and have no intersection line; choose two "
-            "faces of different slope"
-        )
-    direction = direction / length
-    middle = (first.centroid + second.centroid) / 2
-    rows = np.stack([first.normal, second.normal, direction])
-    offset = [(plane.centroid - middle) @ plane.normal for plane in (first, second)]
-    return middle + np.linalg.solve(rows, [*offset, 0.0]), direction
-
-
-def _plane(xyz: np.ndarray, sigma: np.ndarray) -> Plane:
-    return fit_plane(xyz, sigma[0], sigma[2])
-
-
 def _of_house(
     xyz: np.ndarray, near: np.ndarray, even: np.ndarray, graph: "scipy.sparse.csr_matrix", sigma: np.ndarray, least: int
 ) -> list[Patch]:
@@ -285,7 +261,7 @@ def _faces(
     for member in members:
         points = xyz[member]
         if len(member) >= max(least, 4) and np.linalg.eigvalsh(np.cov(points[:, :2].T))[0] > (_WIDTH * sigma[0]) ** 2:
-            plane = _plane(points, sigma)
+            plane = fit_plane(points, sigma[0], sigma[2])
             if plane.sigma0 < _SPREAD:
                 faces.append(member)
                 planes.append(plane)

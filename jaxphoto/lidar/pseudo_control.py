@@ -18,11 +18,11 @@ height of the point*, and g the slope of the ground. Seen along the ray, the sur
     Z = Z_0 + h . q,    h = g / (1 - g . t)
 
 and the error of a laser point is (1 + h . t) e_Z - h . e_XY: as a function of q it is a surface of slope h, measured
-with errors (1 + h . t) sigma_Z and sigma_XY. `height_estimate` propagates these errors, and the bias of weights that do
+with errors (1 + h . t) sigma_Z and sigma_XY. `heights` propagates these errors, and the bias of weights that do
 not reproduce a slope. The result is the accuracy of the surface height at the intersection, without errors of the ray.
 """
 
-from typing import Literal, NamedTuple, get_args
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
@@ -40,11 +40,10 @@ from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Corrections, apparent_point, ground_point
 from jaxphoto.georeferencing.corrections import NO_CORRECTIONS
 from jaxphoto.lidar.grid import Grid, around, index_cloud
-from jaxphoto.lidar.height_estimate import (
+from jaxphoto.lidar.heights import (
     HeightFlag,
     HeightSettings,
     LidarNoise,
-    LocalFit,
     Neighbours,
     excess,
     fit_surface,
@@ -55,8 +54,6 @@ from jaxphoto.lidar.height_estimate import (
 from jaxphoto.lidar.sight import Skyline, empty_about, first_met, levels, skyline, surrounded, window_reach
 from jaxphoto.observations import ControlCoordinates
 from jaxphoto.unknowns import Unknowns
-
-Interpolation = Literal["weighted", "plane"]
 
 # Ratio of candidates to points used: sufficient for a slope, even if half of them are hidden.
 _CANDIDATES = 3
@@ -84,17 +81,6 @@ class PseudoControl(eqx.Module):
     """Standard deviation (m) of the laser points about the plane through them."""
 
 
-class _Numbers(NamedTuple):
-    """Numerical settings."""
-
-    power: Float[Array, ""]
-    sigma_z: Float[Array, ""]
-    sigma_xy: Float[Array, ""]
-    systematic: Float[Array, ""]
-    leafy: Float[Array, ""]
-    refuse: Float[Array, ""]
-
-
 class _Ray(NamedTuple):
     """Ray of a feature: (X, Y) = origin + run (Z - Z of the origin)."""
 
@@ -111,14 +97,6 @@ class _Ray(NamedTuple):
         return self.origin[:2] + self.run * (z - self.origin[2])[..., None]
 
 
-class _Candidates(eqx.Module):
-    """Laser points around a ray, nearest in the image first."""
-
-    index: Int[Array, "m"]
-    seen: Bool[Array, "m"]
-    broken: Bool[Array, ""]
-
-
 def pseudo_control_points(
     interior: InteriorOrientation,
     exterior: ExteriorOrientation,
@@ -126,33 +104,19 @@ def pseudo_control_points(
     cloud: Cloud | Grid,
     settings: HeightSettings | None = None,
     *,
-    interpolation: Interpolation = "weighted",
     corrections: Corrections = NO_CORRECTIONS,
 ) -> PseudoControl:
     """Compute the pseudo control points of features measured at `xy` (mm) with one camera, in a cloud.
 
     Pass a `Grid` to avoid re-indexing the cloud. `exterior`: one image, or a leading axis over the features. The
-    `settings.points` nearest laser points are weighted by d^-`settings.power` (paper 001). `interpolation="plane"` fits
-    a plane to three times as many points, which halves the error on planar ground. One compiled program is used for all
-    features.
+    `settings.points` nearest laser points are weighted by d^-`settings.power` (paper 001). One compiled program is used
+    for all features.
 
     `xyz` is differentiable with respect to `interior`, `exterior` and `xy`, exactly except where the set of nearest
-    points changes; `sigma_z` and the other properties are not. Raises InputError for an unknown interpolation, a radius
-    in `settings`, and an empty `xy`. Source: paper 001, section 3.1.
+    points changes; `sigma_z` and the other properties are not. Raises InputError for an empty `xy`. Source: paper 001,
+    section 3.1.
     """
     settings = HeightSettings() if settings is None else settings
-    if interpolation not in get_args(Interpolation):
-        raise InputError(f"unknown interpolation {interpolation!r}; choose one of {', '.join(get_args(Interpolation))}")
-    if settings.radius_m is not None:
-        raise InputError("pseudo control uses the nearest laser points in the image: give points, not radius_m")
-    numbers = (
-        settings.power,
-        settings.sigma_z_m,
-        settings.sigma_xy_m,
-        settings.sigma_systematic_m,
-        settings.leafy_share,
-        settings.refuse,
-    )
     grid, n = cloud if isinstance(cloud, Grid) else index_cloud(cloud), len(xy)
     if not n:
         raise InputError("no features: give one or more image coordinates")
@@ -161,8 +125,8 @@ def pseudo_control_points(
     found = call_compiled(
         _pseudo_control, jax.tree.map(to_numpy, interior),
         jax.tree.map(lambda v: to_numpy(v) if one else to_numpy(v)[rows], exterior), to_numpy(xy)[rows], grid,
-        skyline(grid), _Numbers(*map(as_jax_array, numbers)), settings.points,
-        window_reach(grid, _CANDIDATES * settings.points), interpolation, corrections,
+        skyline(grid), jax.tree.map(as_jax_array, settings), settings.points,
+        window_reach(grid, _CANDIDATES * settings.points), corrections,
     )  # fmt: skip
     return jax.tree.map(lambda v: to_numpy(v)[:n], found)
 
@@ -174,21 +138,71 @@ def _pseudo_control(
     xy: Float[Array, "n 2"],
     grid: Grid,
     sky: Skyline,
-    numbers: _Numbers,
+    settings: Any,
     points: int,
     reach: int,
-    interpolation: Interpolation,
     corrections: Corrections,
 ) -> PseudoControl:
+    """Compute the pseudo control points; `settings` are a `HeightSettings` of arrays: changes need no recompilation."""
     one = exterior.position.ndim == 1
+    cloud, leafy = jnp.asarray(grid.xyz), jnp.asarray(grid.leafy)
+
+    def choose(interior, exterior, xy):
+        """Return the laser points around the ray of a feature (index, mask of seen ones, True near a step), nearest in
+        the image first; and True if the ray intersects the cloud.
+        """
+        ideal = interior.ideal_from_measured(xy)
+        ray = _Ray(*image_ray(interior, exterior, xy))
+        place, intersected = first_met(ray.origin, ray.direction, sky, grid)
+
+        def squared_distance(point):
+            aim = apparent_point(exterior.position, point, corrections)
+            offset = project_ideal(interior, exterior, aim) - ideal
+            return jnp.where(interior.projection.sees(*camera_coordinates(exterior, aim)), offset @ offset, jnp.inf)
+
+        def again(_, state):
+            place, (_, _, broken) = state
+            index, there = around(grid, place, reach)
+            squared = jnp.where(there, jax.vmap(squared_distance)(cloud[index]), jnp.inf)
+            nearness, first = jax.lax.top_k(-squared, min(_CANDIDATES * points, len(squared)))
+            index, there = index[first], jnp.isfinite(nearness)
+            z = cloud[index, 2]
+            seen, near_step = levels(cloud[index, :2] - ray.at(z), z, there, ray.run, points, settings.sigma_z_m)
+            near = seen & (jnp.cumsum(seen) <= points)
+            mean = jnp.sum(jnp.where(near, z, 0)) / jnp.maximum(near.sum(), 1)
+            # Keep `broken` of earlier iterations: the image may show a step that the ray passes.
+            return jnp.where(near.any(), ray.at(mean), place), (index, seen, near_step | broken)
+
+        some = around(grid, place, reach)[0][: _CANDIDATES * points]
+        none = some, jnp.zeros(len(some), bool), jnp.array(False)
+        return *jax.lax.fori_loop(0, _ROUNDS, again, (place, none))[1], intersected
 
     def of_feature(data):
         image, at = (exterior, data) if one else data
-        held = jax.lax.stop_gradient((interior, image, at))
-        chosen, intersected = _choose(*held, grid, sky, numbers, points, reach, corrections)
-        return _interpolated(
-            interior, image, at, grid, chosen, intersected, numbers, points, interpolation, corrections
+        index, seen, broken, intersected = choose(*jax.lax.stop_gradient((interior, image, at)))
+        xyz = cloud[index]
+        ray = _Ray(*image_ray(interior, image, at))
+        base = jnp.sum(jnp.where(seen, xyz[:, 2], 0)) / jnp.maximum(seen.sum(), 1)
+        q = xyz[:, :2] - ray.at(xyz[:, 2])
+        distance = jax.lax.stop_gradient(jnp.hypot(q[:, 0], q[:, 1]))
+        around_ray = Neighbours(q, xyz[:, 2] - base, distance, seen)
+        shown = jax.vmap(lambda p: project(interior, image, apparent_point(image.position, p, corrections)))(xyz)
+        squared = jnp.sum((shown - at) ** 2, axis=1)
+        distances = jax.lax.stop_gradient(jnp.where(seen, squared, jnp.inf))
+        nearest = seen & (jnp.sum(distances < distances[:, None], axis=1) < points)
+        weight = inverse_distance_weights(squared, nearest, settings.power)
+        point, ahead = ground_point(interior, image, at, base + weight @ around_ray.z, corrections)
+
+        lost = ~(intersected & ahead & seen.any())
+        sigma, flag, gradient, roughness = jax.lax.stop_gradient(
+            _described(around_ray, weight, ray, broken, settings, points)
         )
+        fraction = jnp.sum(jnp.where(weight != 0, leafy[index], False)) / jnp.sum(weight != 0)
+        flag |= ((fraction > 0) & (fraction >= settings.leafy_share)) * int(HeightFlag.VEGETATION)
+        flag = jnp.where(lost, int(HeightFlag.HOLE), flag)
+        refused = lost | (flag & settings.refuse.astype(int) != 0)
+        point, sigma = (jnp.where(refused, jnp.nan, value) for value in (point, sigma))
+        return PseudoControl(point, sigma, flag, gradient, roughness)
 
     data = xy if one else (exterior, xy)
     portions = jax.tree.map(lambda v: v.reshape(-1, min(_AT_ONCE, len(v)), *v.shape[1:]), data)
@@ -196,106 +210,20 @@ def _pseudo_control(
     return jax.tree.map(lambda v: v.reshape(-1, *v.shape[2:]), results)
 
 
-def _choose(
-    interior: InteriorOrientation,
-    exterior: ExteriorOrientation,
-    xy: Float[Array, "2"],
-    grid: Grid,
-    sky: Skyline,
-    numbers: _Numbers,
-    points: int,
-    reach: int,
-    corrections: Corrections,
-) -> tuple[_Candidates, Bool[Array, ""]]:
-    """Select the candidates of a feature; return them, and True if its ray intersects the cloud."""
-    ideal = interior.ideal_from_measured(xy)
-    ray = _Ray(*image_ray(interior, exterior, xy))
-    place, intersected = first_met(ray.origin, ray.direction, sky, grid)
-
-    def squared_distance(point):
-        aim = apparent_point(exterior.position, point, corrections)
-        offset = project_ideal(interior, exterior, aim) - ideal
-        return jnp.where(interior.projection.sees(*camera_coordinates(exterior, aim)), offset @ offset, jnp.inf)
-
-    def candidates(place):
-        index, there = around(grid, place, reach)
-        squared = jnp.where(there, jax.vmap(squared_distance)(jnp.asarray(grid.xyz)[index]), jnp.inf)
-        nearness, first = jax.lax.top_k(-squared, min(_CANDIDATES * points, len(squared)))
-        index, there = index[first], jnp.isfinite(nearness)
-        xyz = jnp.asarray(grid.xyz)[index]
-        z = xyz[:, 2]
-        level = levels(xyz[:, :2] - ray.at(z), z, there, ray.run, points, numbers.sigma_z)
-        return _Candidates(index, level.seen, level.broken), z
-
-    def again(_, state):
-        place, previous = state
-        new, z = candidates(place)
-        near = new.seen & (jnp.cumsum(new.seen) <= points)
-        mean = jnp.sum(jnp.where(near, z, 0)) / jnp.maximum(near.sum(), 1)
-        # Keep `broken` of earlier iterations: the image may show a step that the ray passes.
-        new = _Candidates(new.index, new.seen, new.broken | previous.broken)
-        return jnp.where(near.any(), ray.at(mean), place), new
-
-    some = around(grid, place, reach)[0][: _CANDIDATES * points]
-    none = _Candidates(some, jnp.zeros(len(some), bool), jnp.array(False))
-    return jax.lax.fori_loop(0, _ROUNDS, again, (place, none))[1], intersected
-
-
-def _interpolated(
-    interior: InteriorOrientation,
-    exterior: ExteriorOrientation,
-    xy: Float[Array, "2"],
-    grid: Grid,
-    chosen: _Candidates,
-    intersected: Bool[Array, ""],
-    numbers: _Numbers,
-    points: int,
-    interpolation: Interpolation,
-    corrections: Corrections,
-) -> PseudoControl:
-    """Interpolate the pseudo control point of a feature from its candidates."""
-    xyz = jnp.asarray(grid.xyz)[chosen.index]
-    ray = _Ray(*image_ray(interior, exterior, xy))
-    base = jnp.sum(jnp.where(chosen.seen, xyz[:, 2], 0)) / jnp.maximum(chosen.seen.sum(), 1)
-    q = xyz[:, :2] - ray.at(xyz[:, 2])
-    distance = jax.lax.stop_gradient(jnp.hypot(q[:, 0], q[:, 1]))
-    around_ray = Neighbours(q, xyz[:, 2] - base, distance, chosen.seen)
-    fit = fit_surface(around_ray, 1.0 * chosen.seen, quadratic=False)
-    if interpolation == "plane":
-        weight = fit.rows[0]
-    else:
-        shown = jax.vmap(lambda p: project(interior, exterior, apparent_point(exterior.position, p, corrections)))(xyz)
-        squared = jnp.sum((shown - xy) ** 2, axis=1)
-        distances = jax.lax.stop_gradient(jnp.where(chosen.seen, squared, jnp.inf))
-        nearest = chosen.seen & (jnp.sum(distances < distances[:, None], axis=1) < points)
-        weight = inverse_distance_weights(squared, nearest, numbers.power)
-    z = base + weight @ around_ray.z
-    point, ahead = ground_point(interior, exterior, xy, z, corrections)
-
-    lost = ~(intersected & ahead & chosen.seen.any())
-    described = _described(around_ray, weight, fit, ray, chosen.broken, numbers, points)
-    sigma, flag, gradient, roughness = jax.lax.stop_gradient(described)
-    leafy = jnp.sum(jnp.where(weight != 0, jnp.asarray(grid.leafy)[chosen.index], False)) / jnp.sum(weight != 0)
-    flag |= ((leafy > 0) & (leafy >= numbers.leafy)) * int(HeightFlag.VEGETATION)
-    flag = jnp.where(lost, int(HeightFlag.HOLE), flag)
-    unless_refused = lambda value: jnp.where(lost | (flag & numbers.refuse.astype(int) != 0), jnp.nan, value)  # noqa: E731
-    return PseudoControl(unless_refused(point), unless_refused(sigma), flag, gradient, roughness)
-
-
 def _described(
     near: Neighbours,
     weight: Float[Array, "m"],
-    fit: LocalFit,
     ray: _Ray,
     broken: Bool[Array, ""],
-    numbers: _Numbers,
+    settings: HeightSettings,
     points: int,
 ) -> tuple[Float[Array, ""], Int[Array, ""], Float[Array, "2"], Float[Array, ""]]:
     """Return standard deviation, flags, gradient and roughness."""
+    fit = fit_surface(near, 1.0 * near.there, quadratic=False)
     slope = fit.coefficients[1:3]
-    noise = LidarNoise(jnp.abs(1 + slope @ ray.run) * numbers.sigma_z, numbers.sigma_xy)
+    noise = LidarNoise(jnp.abs(1 + slope @ ray.run) * settings.sigma_z_m, settings.sigma_xy_m)
     expected = noise_variance(fit, noise)
-    sigma = jnp.hypot(height_sigma(near, weight, fit, noise), numbers.systematic)
+    sigma = jnp.hypot(height_sigma(near, weight, fit, noise), settings.sigma_systematic_m)
     rough = (excess(fit, expected, _HARDLY) > 1) & (fit.variance > _ROUGH**2 * expected)
     hole = (near.there.sum() < points) | empty_about(near.distance, near.there)
     edge = ~surrounded(near.xy, near.there) | ~fit.interpolates
@@ -341,8 +269,6 @@ def pseudo_control_of_block(
     grid: Grid,
     points: Int[np.ndarray, "chosen"] | None = None,
     settings: HeightSettings | None = None,
-    *,
-    interpolation: Interpolation = "weighted",
 ) -> BlockControl:
     """Compute heights from the cloud of `grid`, in the block's frame, for measured `points` (indices; default: all).
 
@@ -362,9 +288,7 @@ def pseudo_control_of_block(
         of = np.flatnonzero(camera == name)
         one, taken = jax.tree.map(lambda v, of=of: v[of], exterior), xy[of]
         interior = jax.tree.map(to_numpy, unknowns.interior[name])
-        control = pseudo_control_points(
-            interior, one, taken, grid, settings, interpolation=interpolation, corrections=block.corrections
-        )
+        control = pseudo_control_points(interior, one, taken, grid, settings, corrections=block.corrections)
         steep = call_compiled(_falls, interior, one, taken)
         found.append((of, jax.tree.map(np.asarray, control), np.asarray(steep)))
     back = np.argsort(np.concatenate([of for of, _, _ in found]))

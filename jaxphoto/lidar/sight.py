@@ -34,15 +34,6 @@ class Skyline(NamedTuple):
     high: Float[np.ndarray, ""]
 
 
-class Levels(NamedTuple):
-    """Visible laser points around a ray, on ground or roof with one level or two."""
-
-    seen: Bool[Array, "m"]
-    """True for points of the level that the image shows at the feature."""
-    broken: Bool[Array, ""]
-    """True if the feature is so close to a step that its level is ambiguous."""
-
-
 def skyline(grid: Grid) -> Skyline:
     """Compute the highest points of the cells of `grid`."""
     rows, columns = (int(v) for v in grid.shape)
@@ -99,8 +90,10 @@ def levels(
     run: Float[Array, "2"],
     neighbours: int,
     sigma_z: Float[Array, ""],
-) -> Levels:
+) -> tuple[Bool[Array, "m"], Bool[Array, ""]]:
     """Select the laser points nearest to a ray, at heights `z` (m), that the image shows; nearest first.
+
+    The second value is True if the feature is so close to a step that its level is ambiguous.
 
     The heights are divided at their largest gap, if noise and slope cannot explain it. The upper level hides the lower
     one wherever it surrounds the feature. The feature is at the step between both if neither surrounds it, or if the
@@ -115,13 +108,14 @@ def levels(
     spread = jnp.sqrt((_squares(z, upper) + _squares(z, lower)) / jnp.maximum(there.sum(), 1))
     two = gaps[widest] > jnp.maximum(_GAP_NOISE * sigma_z, _GAP_SPREAD * spread)
 
-    above, below = _around(q, upper, neighbours), _around(q, lower, neighbours)
+    balanced, above, reach_above = _around(q, upper, neighbours)
+    below_balanced, below, reach_below = _around(q, lower, neighbours)
     reach = jnp.sqrt(jnp.max(jnp.where(there, jnp.sum(q**2, axis=1), 0)))
     behind = jnp.hypot(run[0], run[1]) * gaps[widest] > reach
-    on_upper = above.balanced & (behind | (below.nearest > above.reach))
-    on_lower = ~above.balanced & below.balanced & (above.nearest > below.reach)
-    seen = jnp.where(two, jnp.where(above.balanced, upper, lower), there)
-    return Levels(seen, two & ~(on_upper | on_lower))
+    on_upper = balanced & (behind | (below > reach_above))
+    on_lower = ~balanced & below_balanced & (above > reach_below)
+    seen = jnp.where(two, jnp.where(balanced, upper, lower), there)
+    return seen, two & ~(on_upper | on_lower)
 
 
 def surrounded(q: Float[ArrayLike, "m 2"], which: Bool[ArrayLike, "m"]) -> Bool[Array, ""]:
@@ -144,15 +138,10 @@ def empty_about(distance: Float[ArrayLike, "m"], which: Bool[ArrayLike, "m"]) ->
     return (near / jnp.where(far > 0, far, 1)) ** 2 > 1 - _EMPTY ** (1 / jnp.maximum(which.sum() - 1, 1))
 
 
-class _Place(NamedTuple):
-    """Position of the points of one level relative to the feature."""
-
-    balanced: Bool[Array, ""]
-    nearest: Float[Array, ""]
-    reach: Float[Array, ""]
-
-
-def _around(q: Float[Array, "m 2"], which: Bool[Array, "m"], neighbours: int) -> _Place:
+def _around(
+    q: Float[Array, "m 2"], which: Bool[Array, "m"], neighbours: int
+) -> tuple[Bool[Array, ""], Float[Array, ""], Float[Array, ""]]:
+    """Return True if the points `which` are balanced about the feature; their nearest and farthest distance."""
     distance = jnp.hypot(q[:, 0], q[:, 1])
     count = which.sum()
     mean = jnp.sum(jnp.where(which[:, None], q, 0), axis=0) / jnp.maximum(count, 1)
@@ -160,7 +149,7 @@ def _around(q: Float[Array, "m 2"], which: Bool[Array, "m"], neighbours: int) ->
     balanced = (count >= 3) & (jnp.hypot(mean[0], mean[1]) < _BALANCED * farthest)
     near = which & (jnp.cumsum(which) <= neighbours)
     reach = jnp.where(count < neighbours, jnp.inf, jnp.max(jnp.where(near, distance, 0)))
-    return _Place(balanced, jnp.min(jnp.where(which, distance, jnp.inf)), reach)
+    return balanced, jnp.min(jnp.where(which, distance, jnp.inf)), reach
 
 
 def _squares(z: Float[Array, "m"], which: Bool[Array, "m"]) -> Float[Array, ""]:

@@ -3,25 +3,21 @@
 The plane of a cell minimises the squared distances of its returns: it contains their mean, and its normal is the
 eigenvector of the smallest eigenvalue of their scatter. A cell is used if it has enough returns that cover the cell and
 are no rougher than a hard surface (no vegetation, no edge). Planes of two strips correspond if their normals agree and
-their means are close. All sums are accumulated in one pass over the returns (`CellReturns`). Source: Glira, Pfeifer,
-Briese and Ressl (2015), A correspondence framework for ALS strip adjustments based on variants of the ICP algorithm;
-selection, matching and rejection apply to single points there, to cells here.
+their means are close. Source: Glira, Pfeifer, Briese and Ressl (2015), A correspondence framework for ALS strip
+adjustments based on variants of the ICP algorithm; selection, matching and rejection apply to single points there, to
+cells here.
 """
 
 import dataclasses
-from collections.abc import Sequence
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 import scipy
 from jaxtyping import Bool, Float, Int
 
+from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
-
-_POSITIVE = (
-    "cell_m", "roughness_m", "least_roughness_m", "normals_deg", "outlier", "knots_s", "correlation_s",
-    "sigma_position_m", "sigma_attitude_deg", "sigma_heading_deg", "sigma_exposure_m", "sigma_exposure_deg",
-)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,8 +48,7 @@ class StripSettings:
     sigma_exposure_deg: float = 0.002
 
     def __post_init__(self) -> None:
-        for name in _POSITIVE:
-            value = getattr(self, name)
+        for name, value in vars(self).items():
             if not (np.isfinite(value) and value > 0):
                 raise InputError(f"{name} is {value:g}: give a positive number")
         if self.returns < 4 or self.most < 1:
@@ -67,29 +62,48 @@ class StripSettings:
         return np.deg2rad([self.sigma_attitude_deg, self.sigma_attitude_deg, self.sigma_heading_deg])
 
 
-# Returns of a strip by grid cell: count, mean and scatter, accumulated in parts.
-#
-# For parts of a cell with counts n_k, means m_k and scatters S_k about them, the total has the common mean m, and
-# S = sum (S_k + n_k (m_k - m) (m_k - m)'), without loss of digits to squares of coordinates. Source: Chan, Golub and
-# LeVeque (1979), Updating formulae and a pairwise algorithm for computing sample variances.
+class Raster(NamedTuple):
+    """Values (m) of square cells, NaN if missing; `west` and `north` (m) are outer edges of cell (0, 0)."""
 
-# Number of parts after which they are merged: a trade-off between memory and time.
-_PARTS = 8
+    heights: Float[np.ndarray, "rows columns"]
+    west: float
+    north: float
+    cell_m: float
+
+    @property
+    def extent(self) -> Float[np.ndarray, "2 2"]:
+        """Return the minimum and maximum X, Y (m) of the outer edges."""
+        rows, columns = self.heights.shape
+        east, south = self.west + columns * self.cell_m, self.north - rows * self.cell_m
+        return np.array([[self.west, south], [east, self.north]])
 
 
-class CellReturns(NamedTuple):
-    """Sums for the planes of a strip, by cell in ascending order."""
+def strip_differences(cloud: Cloud, settings: StripSettings) -> Raster | None:
+    """Compute the gaps (m) of strips in cells of `settings.cell_m`, NaN without a gap; None if there are no gaps.
 
-    cell: Int[np.ndarray, "n"]
-    returns: Int[np.ndarray, "n"]
-    mean: Float[np.ndarray, "n 3"]
-    """Mean of the returns (m)."""
-    measured: Float[np.ndarray, "n 3"]
-    """Mean of the uncorrected returns (m)."""
-    time: Float[np.ndarray, "n"]
-    """Mean time of the returns (s)."""
-    scatter: Float[np.ndarray, "n 3 3"]
-    """Sum of squares and products of the returns about their mean (m^2)."""
+    The gap of a cell with planes of two strips is the height of the later plane above the earlier one at their mean
+    position; for more than two strips it is the gap of the two that differ most. Rough ground and partly covered cells
+    have no plane and no gap, so slopes and trees cause none.
+    """
+    strips = [cloud.xyz[cloud.strip == k] for k in range(len(cloud.strips))]
+    patches = [planes_of(xyz, xyz, np.zeros(len(xyz)), cells_of(xyz, settings), settings) for xyz in strips]
+    cell = np.concatenate([p.cell for p in patches])
+    if not len(cell):
+        return None
+    west, south = columns_and_rows(cell).min(axis=1)
+    east, north = columns_and_rows(cell).max(axis=1) + 1
+    gaps = np.full((north - south, east - west), np.nan)
+    for one, other in combinations(patches, 2):
+        pairs = corresponding(one, other, settings)
+        column, up = columns_and_rows(pairs.cell)
+        # The gap is along the normal, earlier above later strip.
+        height = -pairs.gap / pairs.normal[:, 2]
+        row, column = north - 1 - up, column - west
+        larger = ~(np.abs(gaps[row, column]) >= np.abs(height))
+        gaps[row[larger], column[larger]] = height[larger]
+    if np.isnan(gaps).all():
+        return None
+    return Raster(gaps, west * settings.cell_m, north * settings.cell_m, settings.cell_m)
 
 
 def cells_of(xyz: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.ndarray, "n"]:
@@ -98,76 +112,10 @@ def cells_of(xyz: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.n
     return (column << 32) + up
 
 
-def columns_and_rows(cell: Int[np.ndarray, "n"]) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
+def columns_and_rows(cell: Int[np.ndarray, "n"]) -> Int[np.ndarray, "2 n"]:
     """Return column and row of cells of `cells_of` relative to the origin."""
     up = ((cell + (1 << 31)) & 0xFFFFFFFF) - (1 << 31)
-    return (cell - up) >> 32, up
-
-
-def gathered(
-    xyz: Float[np.ndarray, "n 3"],
-    measured: Float[np.ndarray, "n 3"],
-    time: Float[np.ndarray, "n"],
-    cell: Int[np.ndarray, "n"],
-) -> CellReturns:
-    """Accumulate returns by cell: `xyz` corrected, `measured` uncorrected coordinates (m), `time` (s)."""
-    cells, of = np.unique(cell, return_inverse=True)
-    return _together(cells, of, np.ones(len(of), int), xyz, measured, time, None)
-
-
-def joined(parts: Sequence[CellReturns]) -> CellReturns:
-    """Merge the cells of parts of one strip."""
-    columns = (np.concatenate(of_parts) for of_parts in zip(*parts, strict=True))
-    cell, count, mean, measured, time, scatter = columns
-    cells, of = np.unique(cell, return_inverse=True)
-    return _together(cells, of, count, mean, measured, time, scatter)
-
-
-def _together(
-    cells: Int[np.ndarray, "cells"],
-    of: Int[np.ndarray, "n"],
-    count: Int[np.ndarray, "n"],
-    mean: Float[np.ndarray, "n 3"],
-    measured: Float[np.ndarray, "n 3"],
-    time: Float[np.ndarray, "n"],
-    scatter: Float[np.ndarray, "n 3 3"] | None,
-) -> CellReturns:
-    """Merge means of `count` returns each, and their scatters (None for single returns), by cell `cells[of]`."""
-    total = np.bincount(of, count, len(cells))
-
-    def average(values: np.ndarray) -> np.ndarray:
-        return np.bincount(of, count * values, len(cells)) / total
-
-    middle = np.column_stack([average(v) for v in mean.T])
-    before = middle if measured is mean else np.column_stack([average(v) for v in measured.T])
-    offset = mean - middle[of]
-    result = np.empty((len(cells), 3, 3))
-    for i in range(3):
-        for j in range(i + 1):
-            product = count * (offset[:, i] * offset[:, j])
-            product = product if scatter is None else product + scatter[:, i, j]
-            result[:, i, j] = result[:, j, i] = np.bincount(of, product, len(cells))
-    return CellReturns(cells, total.astype(int), middle, before, average(time), result)
-
-
-class CellTally:
-    """Accumulated cells of several strips; the returns are not stored."""
-
-    def __init__(self, settings: StripSettings) -> None:
-        self.settings = settings
-        self._parts: dict[str, list[CellReturns]] = {}
-
-    def add(self, key: str, xyz: Float[np.ndarray, "n 3"]) -> None:
-        """Add returns (m) of the strip `key`."""
-        parts = self._parts.setdefault(key, [])
-        parts.append(gathered(xyz, xyz, np.zeros(len(xyz)), cells_of(xyz, self.settings)))
-        if len(parts) > _PARTS:
-            parts[:] = [joined(parts)]
-
-    @property
-    def strips(self) -> dict[str, CellReturns]:
-        """Return the cells of each strip, in order of arrival."""
-        return {key: joined(parts) for key, parts in self._parts.items()}
+    return np.stack([(cell - up) >> 32, up])
 
 
 # Moderated variances (empirical Bayes) from few values each.
@@ -194,21 +142,16 @@ def moderated_variances(variance: Float[np.ndarray, "n"], freedom: Int[np.ndarra
     scatter = float(np.var(log, ddof=1) - np.mean(scipy.special.polygamma(1, half)))
     if scatter <= 0:
         return np.full(len(variance), np.exp(np.mean(log)))
-    prior = _inverse_trigamma(scatter)
+    # Invert trigamma by Newton's method on 1 / trigamma, nearly linear and convex: monotone convergence.
+    prior = 0.5 + 1 / scatter
+    for _ in range(_ROUNDS):
+        slope = scipy.special.polygamma(1, prior)
+        step = float(slope * (1 - slope / scatter) / scipy.special.polygamma(2, prior))
+        prior += step
+        if abs(step) < 1e-9 * prior:
+            break
     common = np.exp(np.mean(log) + scipy.special.digamma(prior) - np.log(prior))
     return (prior * common + half * variance) / (prior + half)
-
-
-def _inverse_trigamma(value: float) -> float:
-    """Invert trigamma by Newton's method on 1 / trigamma, which is nearly linear and convex: monotone convergence."""
-    x = 0.5 + 1 / value
-    for _ in range(_ROUNDS):
-        slope = scipy.special.polygamma(1, x)
-        step = float(slope * (1 - slope / value) / scipy.special.polygamma(2, x))
-        x += step
-        if abs(step) < 1e-9 * x:
-            break
-    return x
 
 
 # Minimum spread of a patch along its shorter axis, as a fraction of the cell; a full cell has 0.29.
@@ -263,13 +206,19 @@ def planes_of(
     settings: StripSettings,
 ) -> StripPatches:
     """Fit the planes of a strip: `xyz` corrected, `measured` uncorrected returns (m), `cell` from `cells_of`."""
-    return planes_from(gathered(xyz, measured, time, cell), settings)
+    cells, of = np.unique(cell, return_inverse=True)
+    count = np.bincount(of, minlength=len(cells))
 
+    def average(values: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(of, v, len(cells)) for v in values.T], axis=-1) / count[:, None]
 
-def planes_from(cells: CellReturns, settings: StripSettings) -> StripPatches:
-    """Fit the planes of a strip from sums by cell."""
-    count = cells.returns
-    value, axes = np.linalg.eigh(cells.scatter)
+    mean = average(xyz)
+    offset = xyz - mean[of]
+    scatter = np.empty((len(cells), 3, 3))
+    for i in range(3):
+        for j in range(i + 1):
+            scatter[:, i, j] = scatter[:, j, i] = np.bincount(of, offset[:, i] * offset[:, j], len(cells))
+    value, axes = np.linalg.eigh(scatter)
     roughness = np.sqrt(np.maximum(value[:, 0], 0.0) / np.maximum(count - 3, 1))
     usable = (
         (count >= settings.returns)
@@ -280,26 +229,19 @@ def planes_from(cells: CellReturns, settings: StripSettings) -> StripPatches:
     along = axes[usable][:, :, 1:]
     # A roughness below every scanner's noise is accidental: limit it.
     variance = np.maximum(roughness[usable], settings.least_roughness_m) ** 2
+    # Horizontal errors make steep planes rougher: moderate variances by planes of similar slope.
+    above = steep(normal[usable])
+    for part in (above, ~above):
+        variance[part] = moderated_variances(variance[part], (count[usable] - 3)[part])
     return StripPatches(
-        cells.cell[usable], count[usable], cells.mean[usable], cells.measured[usable], cells.time[usable],
-        normal[usable], np.sqrt(_moderated(variance, count[usable] - 3, normal[usable])),
-        np.einsum("nik,nk,njk->nij", along, 1 / value[usable][:, 1:], along),
+        cells[usable], count[usable], mean[usable], average(measured)[usable], average(time[:, None])[usable, 0],
+        normal[usable], np.sqrt(variance), np.einsum("nik,nk,njk->nij", along, 1 / value[usable][:, 1:], along),
     )  # fmt: skip
 
 
 def steep(normal: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     """Return True for planes steep enough to determine shifts in X and Y."""
     return normal[:, 2] < np.cos(np.deg2rad(_STEEP_DEG))
-
-
-def _moderated(
-    variance: Float[np.ndarray, "n"], freedom: Int[np.ndarray, "n"], normal: Float[np.ndarray, "n 3"]
-) -> Float[np.ndarray, "n"]:
-    """Moderate variances by planes of similar slope: horizontal errors make steep planes rougher."""
-    result, above = variance.copy(), steep(normal)
-    for part in (above, ~above):
-        result[part] = moderated_variances(variance[part], freedom[part])
-    return result
 
 
 def corresponding(one: StripPatches, other: StripPatches, settings: StripSettings) -> PlanePairs:
@@ -386,95 +328,9 @@ def returns_about(
     return index, point
 
 
-def windows_of_returns(index: Int[np.ndarray, "n"], point: Int[np.ndarray, "n"]) -> Float[np.ndarray, "points"]:
-    """Return the mean number of windows, from `returns_about`, that contain a return near each point.
-
-    Multiply variances of planes by it, so that returns shared by close points are counted once.
-    """
-    often = np.bincount(index)[index]
-    return np.bincount(point, often) / np.maximum(np.bincount(point), 1)
-
-
 def on_planes(patches: StripPatches, points: Float[np.ndarray, "points 3"]) -> PointsOnPlanes:
     """Match points with planes of a strip; `patches.cell` is the index of the point."""
     patch, place = np.arange(len(patches.cell)), points[patches.cell]
     up = up_to_plane(patches, patch, place, patches.normal)
     sigma = np.sqrt(variance_of_plane(patches, patch, place))
     return PointsOnPlanes(patch, patches.cell, place + up[:, None] * patches.normal, -up, sigma)
-
-
-# Object points on breaklines: two smooth faces of a strip that intersect, such as the roof faces at a ridge.
-#
-# The returns in a window of two cells about a point are divided by a line, and a plane is fitted to each side. The
-# initial line passes through the point, in the trial direction with the smallest residuals. It is then replaced by the
-# intersection of the two planes, iterated to convergence. The point is constrained to both planes and is free only
-# along their intersection. Source: Habib, Ghanma, Morgan and Al-Ruzouq (2005), Photogrammetric and lidar data
-# registration using linear features, which also derives lidar lines from roofs.
-
-# Trial directions of the dividing line; maximum number of iterations.
-_DIRECTIONS = np.pi * np.arange(12) / 12
-_TURNS = 10
-# Minimum difference of slopes (tangent) of the two planes of a breakline.
-_BREAK = 0.15
-# Fractions of the cell: half width of the ambiguous zone along the line; maximum distance of the line from the point.
-_NEAR, _FAR = 0.1, 0.5
-# Number of robust standard deviations above which a return belongs to another object, such as a chimney.
-_OTHER = 4.0
-
-
-def faces_about(
-    xyz: Float[np.ndarray, "returns 3"], points: Float[np.ndarray, "points 3"], settings: StripSettings
-) -> tuple[Int[np.ndarray, "n"], Int[np.ndarray, "n"]]:
-    """Return pairs (return, face) of the returns on the two faces of each point: point k has the faces 2 k and 2 k + 1.
-
-    A point without two faces has no returns.
-    """
-    index, point = returns_about(xyz, points, dataclasses.replace(settings, cell_m=2 * settings.cell_m))
-    parts = [np.zeros((2, 0), int)]
-    for k in np.flatnonzero(np.bincount(point, minlength=len(points)) >= 2 * settings.returns):
-        candidates = index[point == k]
-        side = _sides(xyz[candidates] - points[k], settings)
-        parts.append(np.stack([candidates, 2 * k + side])[:, side >= 0])
-    index, face = np.concatenate(parts, axis=1)
-    return index, face
-
-
-def _sides(offset: Float[np.ndarray, "n 3"], settings: StripSettings) -> Int[np.ndarray, "n"]:
-    """Return 0 or 1 for the returns on either face about the origin; -1 for neither."""
-    none = np.full(len(offset), -1)
-    tried = [offset[:, :2] @ np.array([np.cos(a), np.sin(a)]) > 0 for a in _DIRECTIONS]
-    tried = [first for first in tried if _enough(first, settings)]
-    if not tried:
-        return none
-    first = min(tried, key=lambda one: float(np.sum(np.square(_fitted(offset, one)[1]))))
-    for _ in range(_TURNS):
-        planes, residual = _fitted(offset, first)
-        constant, slope = planes[0, 0] - planes[1, 0], planes[0, 1:] - planes[1, 1:]
-        size = float(np.linalg.norm(slope))
-        if size < _BREAK or abs(constant) / size > _FAR * settings.cell_m:
-            return none
-        beyond = (constant + offset[:, :2] @ slope) / size
-        parted = beyond > 0
-        # At a ridge each side has the lower of both planes, at a valley the higher.
-        parted = parted if np.mean(parted == first) > 0.5 else ~parted
-        if not _enough(parted, settings):
-            return none
-        if np.array_equal(parted, first):
-            break
-        first = parted
-    spread = 1.4826 * float(np.median(np.abs(residual)))
-    clear = (np.abs(beyond) > _NEAR * settings.cell_m) & (np.abs(residual) <= _OTHER * spread)
-    return np.where(clear, np.where(first, 0, 1), -1)
-
-
-def _enough(first: np.ndarray, settings: StripSettings) -> bool:
-    return settings.returns <= int(first.sum()) <= len(first) - settings.returns
-
-
-def _fitted(offset: Float[np.ndarray, "n 3"], first: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Fit planes to both sides; return their heights at the origin and slopes, and the residual of each return."""
-    rows, residual, planes = np.column_stack([np.ones(len(offset)), offset[:, :2]]), np.empty(len(offset)), []
-    for side in (first, ~first):
-        planes.append(np.linalg.lstsq(rows[side], offset[side, 2])[0])
-        residual[side] = offset[side, 2] - rows[side] @ planes[-1]
-    return np.stack(planes), residual

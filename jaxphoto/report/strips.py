@@ -14,7 +14,7 @@ from rich.console import Console
 
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import TrajectoryKnot
-from jaxphoto.lidar.raster import Raster
+from jaxphoto.lidar.strip_planes import Raster
 from jaxphoto.observations import AttitudeSteps, PositionSteps
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL, SurveyedGap
@@ -71,6 +71,16 @@ def all_correlations(result: StripAdjustment) -> pd.DataFrame:
     labels = list(result.adjusted.structure.labels)
     rho = correlation_matrix(result.covariance)[-len(labels) :, -len(labels) :]
     return pd.DataFrame(rho, columns=labels).set_index(pd.Index(labels, name="parameter"))
+
+
+def gaps_table(before: Raster, after: Raster) -> pd.DataFrame:
+    """Tabulate gaps of strips by cell: X_m and Y_m of its centre, before_m and after_m (m)."""
+    parts = []
+    for name, raster in (("before_m", before), ("after_m", after)):
+        row, column = np.nonzero(np.isfinite(raster.heights))
+        x, y = raster.west + (column + 0.5) * raster.cell_m, raster.north - (row + 0.5) * raster.cell_m
+        parts.append(pd.DataFrame({"X_m": x.round(3), "Y_m": y.round(3), name: raster.heights[row, column]}))
+    return parts[0].merge(parts[1], "outer")
 
 
 def calibration_table(result: StripAdjustment) -> pd.DataFrame:
@@ -137,8 +147,7 @@ def _knot_labels(result: StripAdjustment) -> list[list[str]]:
 def strips_verdict(result: StripAdjustment, tables: Tables | None) -> Verdict:
     """Assess a strip adjustment; `tables` contains its adjustment if it has images."""
     found = _sigma_naught(result) if tables is None else verdict_of(tables).findings
-    warnings = (Finding("message", "warning", sentence) for sentence in result.warnings)
-    return Verdict.of((*_steps(result), *warnings, *_surveyed(result), *found))
+    return Verdict.of((*_steps(result), *_surveyed(result), *found))
 
 
 def _steps(result: StripAdjustment) -> Iterator[Finding]:
@@ -295,14 +304,15 @@ def write_strips(
     result: StripAdjustment,
     tables: Tables | None,
     verdict: Verdict,
+    gaps: tuple[Raster | None, Raster | None],
     directory: Path,
-    write_corrected: Callable[[Path], tuple[Raster, Raster] | None],
+    write_corrected: Callable[[Path], None],
     record: CommandRecord,
 ) -> None:
     """Write tables, report.html, summary.json; with images also the folder `adjustment`.
 
-    `tables` contains the adjustment if it has images. `write_corrected` writes cloud and trajectory into the folder and
-    returns the gaps of the strips before and after.
+    `tables` contains the adjustment if it has images, `gaps` the `strip_differences` before and after.
+    `write_corrected` writes cloud and trajectory into the folder.
     """
     seconds = dict(result.adjusted.seconds)
     files = {
@@ -314,7 +324,11 @@ def write_strips(
         if tables is not None:
             write_results(tables, verdict, work / "adjustment", seconds, record=record)
         all_correlations(result).round(_DIGITS).to_csv(work / "correlation.csv")
-        gaps = write_corrected(work)
+        write_corrected(work)
+        before, after = gaps
+        overlap = None if before is None or after is None else (before, after)
+        if overlap:
+            files["differences"] = gaps_table(*overlap)
         n = len(result.cloud.strips)
         name = f"{n} strip{'s' * (n > 1)}{' and photographs' if result.before else ''}: strip adjustment"
         summary = verdict.summary | {
@@ -323,7 +337,7 @@ def write_strips(
             "pattern": result.errors.calibration.pattern, **surveyed_summary(result),
             "seconds": seconds,
         }  # fmt: skip
-        parts = [*verdict_parts(verdict), *_sections(result, files, gaps)]
+        parts = [*verdict_parts(verdict), *_sections(result, files, overlap)]
         write_study(work, name, (verdict.headline, verdict.colour), parts, summary, record, files)
 
 

@@ -28,7 +28,6 @@ from jaxphoto.simulation.recipe import (
     SimulatedShutter,
     TargetPlan,
 )
-from jaxphoto.simulation.remeasure import image_coordinates, remeasure
 from jaxphoto.simulation.scene import (
     ROLLING,
     ROOFS,
@@ -41,7 +40,7 @@ from jaxphoto.simulation.scene import (
     Trees,
     Wave,
 )
-from jaxphoto.simulation.simulate import Simulation, simulate
+from jaxphoto.simulation.simulate import Simulation, image_coordinates, remeasure, simulate
 
 __all__ = [
     "ROLES", "ROLLING", "ROOFS", "Approximation", "Assumed", "Building", "Buildings", "CameraWalk", "Choice",

@@ -7,7 +7,6 @@ readout.
 import dataclasses
 from collections.abc import Mapping
 
-import equinox as eqx
 import jax
 import numpy as np
 from jaxtyping import Float
@@ -81,25 +80,20 @@ def _strip_hours(flight: Flight, clock: Float[np.ndarray, "images"]) -> tuple[li
     return strips, np.array([clock[of == strip].mean() for strip in strips]) / HOUR_S
 
 
-class Circumstances(eqx.Module):
-    """Time of each image from the middle of the flight (s), and temperature above the reference (K)."""
-
-    time: Float[np.ndarray, "images"]
-    above: Float[np.ndarray, "images"]
-
-
 def reproject_changing(
     recipe: Recipe,
     flight: Flight,
     rays: Rays,
     points: Float[np.ndarray, "points 3"],
     motions: Float[np.ndarray, "images 6"],
-    when: Circumstances,
+    time: Float[np.ndarray, "images"],
+    above: Float[np.ndarray, "images"],
     changes: Changes,
 ) -> Rays:
     """Reproject the rays of images whose camera changes; return all other rays unchanged.
 
-    `motions`: motion of the camera per image, from `camera_motions`. A point at the edge of the format may be moved
+    `motions`: motion of the camera per image, from `camera_motions`; `time` from the middle of the flight (s);
+    `above`: temperature above the reference (K). A point at the edge of the format may be moved
     slightly beyond it.
     """
     xy, own_of = rays.xy.copy(), [_of_images(owners, flight) for owners in changes.values()]
@@ -121,8 +115,8 @@ def reproject_changing(
             bending,
             np.full(len(rows_of), readout_s / recipe.sensors[name].height_mm),
             motions[image],
-            when.time[image],
-            when.above[image],
+            time[image],
+            above[image],
             *(np.asarray(v)[image] for v in place),
             points[rays.point[rows_of]],
         )

@@ -53,8 +53,8 @@ class Flight(NamedTuple):
     motion: Motion
 
 
-def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int, purpose: str = "flight") -> Flight:
-    """Fly `plan` at `mean_height` (m) above zero, with the recipe's jitter from the random stream `purpose`.
+def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int) -> Flight:
+    """Fly `plan` at `mean_height` (m) above zero, with the recipe's jitter.
 
     Every exposure deviates normally from its plan. The body's attitude is roll, pitch, yaw = heading + crab; the true
     mount gives the attitude of the camera.
@@ -64,7 +64,7 @@ def fly(recipe: Recipe, plan: FlightPlan, mean_height: float, seed: int, purpose
     heading = np.deg2rad([strips[k].heading_deg for k in of])
     cameras = tuple(strips[k].camera for k in of)
     position = np.vstack([np.column_stack([s.exposures, np.full(s.images, mean_height + s.height_m)]) for s in strips])
-    jitter, rng, n = recipe.jitter, stream(seed, purpose), len(of)
+    jitter, rng, n = recipe.jitter, stream(seed, "flight"), len(of)
     position = position + rng.standard_normal((n, 3)) * triple(jitter.position_m)
     deviation = np.deg2rad([jitter.angle_deg, jitter.angle_deg, jitter.crab_deg])
     attitude = rng.standard_normal((n, 3)) * deviation + np.column_stack([0 * heading, 0 * heading, heading])

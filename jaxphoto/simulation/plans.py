@@ -13,6 +13,7 @@ from jaxtyping import Bool, Float
 
 from jaxphoto.camera import Sensor
 from jaxphoto.errors import BlockError
+from jaxphoto.georeferencing import Pattern
 from jaxphoto.georeferencing.mount import ImageX
 
 # Number of attempts to draw n positions from 4 n candidates; sufficient if strips cover a thousandth of the area.
@@ -244,9 +245,8 @@ _ZERO = (0.0, 0.0, 0.0)
 class ScanPlan:
     """Laser scanner with lines across the track, up to `scan_angle_deg` on either side of the body's nadir.
 
-    `pattern` is one of `georeferencing.PATTERN_OF`: "oscillating" scans back and forth; "circle" or "risley" has two
-    counter-rotating prisms, "nutating" a constant nadir angle. `density_per_m2` is the pulse density of one strip on
-    level ground at the mean height of the terrain. The scanner flies with the cameras, or on its own `strips`.
+    `pattern` "line" scans from left to right; "circle" has two counter-rotating prisms. `density_per_m2` is the pulse
+    density of one strip on level ground at the mean height of the terrain.
 
     `boresight_deg` (about the body's right, forward and up axes) is the true misalignment. The true position error of a
     strip is `shift_m` (by name or "default") plus a normal error of `shift_sigma_m`; the attitude error is
@@ -259,8 +259,7 @@ class ScanPlan:
 
     density_per_m2: float
     scan_angle_deg: float = 20.0
-    pattern: str = "line"
-    strips: tuple[Strip, ...] = ()
+    pattern: Pattern = "line"
     boresight_deg: Triple = _ZERO
     shift_m: dict[str, Triple] = dataclasses.field(default_factory=dict)
     drift_m_per_s: dict[str, Triple] = dataclasses.field(default_factory=dict)

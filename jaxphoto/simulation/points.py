@@ -178,13 +178,21 @@ def scatter(recipe: Recipe, flight: Flight, terrain: Terrain, seed: int) -> True
     for number, group in enumerate(recipe.targets):
         rng = stream(seed, f"targets {number}")
         stated = _given(group, terrain, recipe.ground, rng)
-        _check_seen(recipe, flight, terrain, stated)
+        often = _rays(recipe, flight, terrain, stated).per_point(len(stated))
+        for k in np.flatnonzero(often < recipe.points.min_images):
+            raise BlockError(
+                f"the target at X {stated[k, 0]:.1f} m, Y {stated[k, 1]:.1f} m is seen in {often[k]} image(s), not in "
+                f"{recipe.points.min_images}; move it inside the block"
+            )
         places = np.vstack([stated, _uniform(recipe, flight, terrain, group.count, rng)])
         begin = counts.get(group.prefix, 0)
         counts[group.prefix] = begin + len(places)
         ids += [f"{group.prefix}{begin + k + 1}" for k in range(len(places))]
         xyz.append(places)
-        roles += _roles(group, places, recipe.ground)
+        roles += [group.role] * len(places)
+        if group.choice is not None:
+            for target in _chosen(group.choice, places[:, :2], recipe.ground):
+                roles[target - len(places)] = group.choice.role
     points = np.vstack(xyz)
     is_target = np.arange(len(points)) >= recipe.points.ties
     return TruePoints(tuple(ids), points, tuple(roles), is_target, _rays(recipe, flight, terrain, points))
@@ -234,24 +242,6 @@ def _given(group: TargetPlan, terrain: Terrain, ground: Swaths | Field, rng: np.
     for k, place in enumerate(group.at_m, start=len(relative)):
         places[k, 2:] = place[2:] or places[k, 2:]
     return places
-
-
-def _check_seen(recipe: Recipe, flight: Flight, terrain: Terrain, xyz: np.ndarray) -> None:
-    counts = _rays(recipe, flight, terrain, xyz).per_point(len(xyz))
-    for k in np.flatnonzero(counts < recipe.points.min_images):
-        x, y, _ = xyz[k]
-        raise BlockError(
-            f"the target at X {x:.1f} m, Y {y:.1f} m is seen in {counts[k]} image(s), not in "
-            f"{recipe.points.min_images}; move it inside the block"
-        )
-
-
-def _roles(group: TargetPlan, xyz: np.ndarray, ground: Swaths | Field) -> list[Role]:
-    roles = [group.role] * len(xyz)
-    if group.choice is not None:
-        for k in _chosen(group.choice, xyz[:, :2], ground):
-            roles[k] = group.choice.role
-    return roles
 
 
 def _chosen(choice: Choice, xy: np.ndarray, ground: Swaths | Field) -> list[int]:

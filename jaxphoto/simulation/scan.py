@@ -13,7 +13,6 @@ from jaxtyping import Array, Float, Int, UInt8
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import (
-    PATTERN_OF,
     Mount,
     Scanner,
     ScannerCalibration,
@@ -29,7 +28,7 @@ from jaxphoto.rotation import (
     roll_pitch_yaw_from_matrix,
     small_rotation,
 )
-from jaxphoto.simulation.flight import NO_BIAS, NO_MOUNT, Flight, fly, record
+from jaxphoto.simulation.flight import NO_BIAS, NO_MOUNT, Flight, record
 from jaxphoto.simulation.plans import FlightPlan, ScanPlan, strip_value
 from jaxphoto.simulation.recipe import Recipe
 from jaxphoto.simulation.sampling import in_chunks, stream
@@ -64,24 +63,19 @@ class Path(NamedTuple):
         return _hermite(self.node, self.position, self.velocity, time), quaternion / length
 
 
-def matrices(quaternion: Float[np.ndarray, "n 4"]) -> Float[np.ndarray, "n 3 3"]:
-    """Return rotation matrices of quaternions."""
-    return in_chunks(_matrices_from_quaternions, _CHUNK_POINTS, quaternion)
+_matrices_from_quaternions = jax.jit(jax.vmap(matrix_from_quaternion))
 
 
-def paths(recipe: Recipe, plan: ScanPlan, flight: Flight, mean_height: float, seed: int) -> list[Path]:
-    """Compute the path of every strip of `plan`, consecutively from time zero: strips of `flight`, or separate ones.
+def paths(recipe: Recipe, plan: ScanPlan, flight: Flight) -> list[Path]:
+    """Compute the path of the scanner in every strip of `flight`, consecutively from time zero.
 
     If exposures lie on the scanner's trajectory, time zero is their mean.
 
     The scanner is at the reference point of GNSS and IMU, at their true positions. Positions and quaternions are cubic
     Hermite splines through each exposure with its velocity and rotation rate. The path is extended straight beyond the
-    first and last exposure by half their footprint. Nodes of a separate flight deviate from the plan like exposures.
+    first and last exposure by half their footprint.
     """
     flown = cast(FlightPlan, recipe.plan)
-    if plan.strips:
-        flown = FlightPlan(plan.strips, flown.speed_m_per_s)
-        flight = fly(recipe, flown, mean_height, seed, "flight of the scanner")
     names = [recipe.mount_of(camera) for camera in flight.cameras]
     true = [recipe.mounts[name].truth if name else NO_MOUNT for name in names]
     # Use the true time of the exposure: time offsets of the camera do not apply.
@@ -131,12 +125,6 @@ def _quaternions_from_angles(roll_pitch_yaw):
     return quaternion_from_matrix(matrix_from_roll_pitch_yaw(roll_pitch_yaw))
 
 
-@jax.jit
-@jax.vmap
-def _matrices_from_quaternions(quaternion):
-    return matrix_from_quaternion(quaternion)
-
-
 def _hermite(
     node: Float[np.ndarray, "k"], value: Float[np.ndarray, "k m"], slope: Float[np.ndarray, "k m"], at: np.ndarray
 ) -> Float[np.ndarray, "n m"]:
@@ -178,7 +166,7 @@ def draw_errors(plan: ScanPlan, paths: list[Path], seed: int) -> StripErrors:
         np.deg2rad(plan.eccentricity_deg),
         np.array(plan.time_offset_s),
     )
-    calibration = ScannerCalibration(*numbers, PATTERN_OF[plan.pattern])  # type: ignore[call-arg]
+    calibration = ScannerCalibration(*numbers, plan.pattern)  # type: ignore[call-arg]
     boresight = np.deg2rad(plan.boresight_deg)
     return StripErrors(tuple(splines), np.concatenate(position), np.concatenate(attitude), boresight, calibration)
 
@@ -187,21 +175,6 @@ def draw_shift(plan: ScanPlan, strip: str, seed: int) -> Float[np.ndarray, "3"]:
     """Draw the shift of a strip (m); drifts are added to it."""
     drawn = stream(seed, f"shift of lidar strip {strip}").standard_normal(3)
     return strip_value(plan.shift_m, strip) + np.array(plan.shift_sigma_m) * drawn
-
-
-def recorded_shot(
-    in_body: Float[np.ndarray, "n 3"], boresight: Float[np.ndarray, "3"], calibration: ScannerCalibration
-) -> Float[np.ndarray, "n 3"]:
-    """Return the recorded shots (m) for true vectors from trajectory to hit, in the body frame.
-
-    Inverse of `georeferencing.corrected_return` for an error-free trajectory.
-    """
-    true = (in_body + calibration.lever_arm) @ np.asarray(_rotation(boresight))
-    shot = true
-    if any(np.any(of) for of in jax.tree.leaves(calibration)):
-        for _ in range(_STEPS):
-            shot = shot + true - in_chunks(lambda s: _corrected(s, calibration), _CHUNK_POINTS, shot)
-    return shot
 
 
 def rotate_body(
@@ -220,7 +193,6 @@ def _drift(spline: StripSpline, correlation_s: float, rng: np.random.Generator) 
     return noise
 
 
-_rotation = jax.jit(small_rotation)
 _rotations = jax.jit(jax.vmap(small_rotation))
 
 
@@ -232,38 +204,24 @@ def _corrected(shot: Float[Array, "n 3"], calibration: ScannerCalibration) -> Fl
 GROUND, VEGETATION, ROOF = 2, 5, 6
 """LAS classes (ASPRS): ground, high vegetation, building."""
 _RATE_HZ = 100.0
-# Frequencies of the two prisms, whose pattern does not repeat within a strip; a nutating mirror uses only the first.
+# Frequencies of the two prisms, whose pattern does not repeat within a strip.
 _PRISMS_HZ = (121.7, -77.3)
 # Tolerance (m) of the intersection with the ground; the iteration does not converge on steeper ground.
 _ENOUGH_M = 1e-7
 _ROUNDS = 60
 # Number of pulses processed at a time; limits memory.
 _PULSES_AT_ONCE = 500_000
-# Maximum number of pulses of a cloud, and of records of a trajectory; limits memory.
-_PULSES, _RECORDS = 1e8, 2e7
+# Maximum number of pulses of a cloud; limits memory.
+_PULSES = 1e8
 
 
-class Scan(NamedTuple):
-    """Measured cloud, recorded trajectory, and the true errors of both."""
-
-    cloud: Cloud
-    trajectory: Trajectory
-    scanner: Scanner
-    """True boresight and shifts of the strips, without their drifts."""
-    errors: StripErrors
-    """All true errors, drifts included."""
-
-
-class _Returns(NamedTuple):
-    """Returns: index of the pulse, distance along the ray (m), class."""
-
-    pulse: Int[np.ndarray, "returns"]
-    at: Float[np.ndarray, "returns"]
-    by: UInt8[np.ndarray, "returns"]
-
-
-def scan(plan: ScanPlan, paths: list[Path], terrain: Terrain, noise_m: Float[np.ndarray, "3"], seed: int) -> Scan:
+def scan(
+    plan: ScanPlan, paths: list[Path], terrain: Terrain, noise_m: Float[np.ndarray, "3"], seed: int
+) -> tuple[Cloud, Trajectory, Scanner, StripErrors]:
     """Scan `terrain` (drawn and settled) from the path of every strip; strips are named 1, 2, ... in order.
+
+    Returns the measured cloud, the recorded trajectory, the true boresight and shifts of the strips without their
+    drifts, and all true errors, drifts included.
 
     The trajectory has the shift and drift errors of its strip; the shots have boresight and calibration errors.
     `corrected_return` with these errors gives the point that was hit plus normal noise of `noise_m` (X, Y, Z). Raises
@@ -287,29 +245,16 @@ def scan(plan: ScanPlan, paths: list[Path], terrain: Terrain, noise_m: Float[np.
     names = tuple(f"{number + 1}" for number in range(len(paths)))
     shifts = [draw_shift(plan, path.strip, seed) for path in paths]
     truth = Scanner(errors.boresight, dict(zip(names, shifts, strict=True)))  # type: ignore[arg-type]
-    return Scan(Cloud(**of_points, strips=names), _trajectory(paths, errors), truth, errors)
+    return Cloud(**of_points, strips=names), _trajectory(paths, errors), truth, errors
 
 
 def _pulses(plan: ScanPlan, paths: list[Path]) -> list[float]:
-    """Return the number of pulses of every path. Raises BlockError for too many pulses, and if the clock error exceeds
-    a strip.
-    """
+    """Return the number of pulses of every path. Raises BlockError for too many pulses."""
     pulses_of = [plan.density_per_m2 * 2 * plan.half_width * path.height_m * path.length_m for path in paths]
     if not sum(pulses_of) <= _PULSES:
         raise BlockError(
             f"the scanner would send {sum(pulses_of):.3g} pulses, the limit is {_PULSES:g}; lower density_per_m2"
         )
-    seconds = sum(path.node[-1] - path.node[0] for path in paths)
-    if not seconds * _RATE_HZ <= _RECORDS:
-        raise BlockError(
-            f"the scanner would fly for {seconds / 3600:.3g} hours; give shorter strips, or a higher speed"
-        )
-    for path in paths:
-        if not abs(plan.time_offset_s) < path.node[-1] - path.node[0]:
-            raise BlockError(
-                f"strip {path.strip} lasts {path.node[-1] - path.node[0]:.3g} s, and the scanner's clock is off by "
-                f"{plan.time_offset_s:g} s; give a smaller time_offset_s"
-            )
     return pulses_of
 
 
@@ -320,26 +265,14 @@ def _pattern(
     # True and recorded time must both lie on the path.
     begin, end = path.node[[0, -1]] + np.clip(plan.time_offset_s, (0.0, -np.inf), (np.inf, 0.0))
     time = begin + (pulses + 0.5) / of * (end - begin)
-    if PATTERN_OF[plan.pattern] == "circle":
-        return time, _around(plan, time)
+    if plan.pattern == "circle":
+        # One rotating vector per prism, added to first order.
+        angles = 2 * np.pi * np.outer(time, _PRISMS_HZ)
+        return time, plan.half_width / 2 * np.column_stack([np.sin(angles).sum(1), np.cos(angles).sum(1)])
     # On level ground, line spacing equals the pulse spacing.
     per_line = max(1, round(2 * plan.half_width * path.height_m * np.sqrt(plan.density_per_m2)))
-    across = _across(plan, (pulses + 0.5) / per_line)
+    across = plan.half_width * (2 * ((pulses + 0.5) / per_line % 1) - 1)
     return time, np.column_stack([across, np.zeros(len(across))])
-
-
-def _across(plan: ScanPlan, line: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
-    """Return the across-track tangents of scan lines: left to right at even steps, or a sine oscillation."""
-    if plan.pattern == "oscillating":
-        return -np.tan(np.deg2rad(plan.scan_angle_deg) * np.cos(np.pi * line))
-    return plan.half_width * (2 * (line % 1) - 1)
-
-
-def _around(plan: ScanPlan, time: Float[np.ndarray, "n"]) -> Float[np.ndarray, "n 2"]:
-    """Return the tangents of circular patterns: one rotating vector per prism, added to first order."""
-    turning = _PRISMS_HZ[:1] if plan.pattern == "nutating" else _PRISMS_HZ
-    angles = 2 * np.pi * np.outer(time, turning)
-    return plan.half_width / len(turning) * np.column_stack([np.sin(angles).sum(1), np.cos(angles).sum(1)])
 
 
 def _measured(
@@ -355,27 +288,29 @@ def _measured(
 ) -> dict[str, np.ndarray]:
     """Return the cloud fields of some pulses, sorted by time and return."""
     position, quaternion = path.pose(time)
-    object_from_body = believed_turn = matrices(quaternion)
+    object_from_body = believed_turn = in_chunks(_matrices_from_quaternions, _CHUNK_POINTS, quaternion)
     recorded, believed_position = time - errors.calibration.time_offset, position
     if errors.calibration.time_offset:
         believed_position, quaternion = path.pose(recorded)
-        believed_turn = matrices(quaternion)
+        believed_turn = in_chunks(_matrices_from_quaternions, _CHUNK_POINTS, quaternion)
     origin = position - object_from_body @ errors.calibration.lever_arm
     body_from_scanner = np.asarray(_small_rotation(errors.boresight))
     # The recorded ray assumes that the scanner axes are the body axes.
     believed = np.column_stack([aside, -np.ones(len(aside))])
     believed /= np.linalg.norm(believed, axis=1, keepdims=True)
     ray = _rotated(object_from_body, believed @ body_from_scanner.T)
-    returns = _returned(origin, ray, terrain, leaves)
-    order = np.lexsort((returns.at, returns.pulse))
-    pulse, at, by = (a[order] for a in returns)
+    pulse, at, by = _returned(origin, ray, terrain, leaves)
+    order = np.lexsort((at, pulse))
+    pulse, at, by = pulse[order], at[order], by[order]
     _, first, of_pulse, count = np.unique(pulse, return_index=True, return_inverse=True, return_counts=True)
     number = np.arange(len(pulse)) - first[of_pulse] + 1
     # Solve `corrected_return` for the recorded point; the noise applies to the corrected point.
     hit = ray[pulse] * at[:, None] + origin[pulse] - position[pulse] + noise.standard_normal((len(pulse), 3)) * noise_m
-    shot = recorded_shot(
-        _rotated(object_from_body[pulse].transpose(0, 2, 1), hit), errors.boresight, errors.calibration
-    )
+    in_body = _rotated(object_from_body[pulse].transpose(0, 2, 1), hit)
+    true = shot = (in_body + errors.calibration.lever_arm) @ body_from_scanner
+    if any(np.any(of) for of in jax.tree.leaves(errors.calibration)):
+        for _ in range(_STEPS):
+            shot = shot + true - in_chunks(lambda s: _corrected(s, errors.calibration), _CHUNK_POINTS, shot)
     shift, turn = errors.at(strip, recorded[pulse])
     return {
         "xyz": believed_position[pulse] + shift + _rotated(rotate_body(believed_turn[pulse], turn), shot),
@@ -387,7 +322,8 @@ def _measured(
 
 def _returned(
     origin: Float[np.ndarray, "n 3"], ray: Float[np.ndarray, "n 3"], terrain: Terrain, rng: np.random.Generator
-) -> _Returns:
+) -> tuple[Int[np.ndarray, "returns"], Float[np.ndarray, "returns"], UInt8[np.ndarray, "returns"]]:
+    """Return the pulse of each return, the distance along its ray (m), and its class."""
     ground = _ground(origin, ray, terrain)
     roof = wall = np.full(len(ray), np.inf)
     if terrain.buildings:
@@ -398,7 +334,7 @@ def _returned(
     last = np.flatnonzero(hits & (wall > end) & ~leaves.stopped)
     by_last = np.where(roof[last] <= ground[last], ROOF, GROUND)
     by = np.concatenate([np.full(len(leaves.pulse), VEGETATION), by_last]).astype(np.uint8)
-    return _Returns(np.concatenate([leaves.pulse, last]), np.concatenate([leaves.at, end[last]]), by)
+    return np.concatenate([leaves.pulse, last]), np.concatenate([leaves.at, end[last]]), by
 
 
 def _ground(origin: np.ndarray, ray: np.ndarray, terrain: Terrain) -> Float[np.ndarray, "n"]:
@@ -443,7 +379,11 @@ def _trajectory(paths: list[Path], errors: StripErrors) -> Trajectory:
     exact = np.zeros((len(position), 3))
     quaternion, turn = np.vstack([q for _, q in poses]), np.vstack([turn for _, turn in errors_at])
     if np.any(turn):
-        quaternion = in_chunks(_quaternions, _CHUNK_POINTS, rotate_body(matrices(quaternion), turn))
+        quaternion = in_chunks(
+            _quaternions,
+            _CHUNK_POINTS,
+            rotate_body(in_chunks(_matrices_from_quaternions, _CHUNK_POINTS, quaternion), turn),
+        )
     return Trajectory(np.concatenate(times), position, quaternion, exact, exact)  # type: ignore[arg-type]
 
 

@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import numpy as np
+import scipy
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.errors import BlockError
@@ -24,31 +25,13 @@ Pairs = tuple[Int[np.ndarray, "pairs"], Int[np.ndarray, "pairs"]]
 def pairs_near(
     xy: Float[np.ndarray, "n 2"], centre: Float[np.ndarray, "m 2"], radius: Float[np.ndarray, "m"], more_m: float = 0.0
 ) -> Pairs:
-    """Return all pairs of a circle and a position within its `radius` plus `more_m` (m); sorted by circle.
-
-    Positions are sorted into square cells as wide as the largest circle: a circle overlaps only the cells around its
-    centre, three contiguous ones in each column.
-    """
+    """Return all pairs of a circle and a position within its `radius` plus `more_m` (m); sorted by circle."""
     if not len(xy) or not len(centre):
         return np.zeros(0, int), np.zeros(0, int)
     # Slightly enlarged: the caller decides about the boundary.
-    reach = radius + more_m + 1e-6
-    low, side = xy.min(axis=0), reach.max()
-    cell = np.floor((xy - low) / side).astype(int) + 1
-    rows = cell[:, 1].max() + 2
-    key = cell[:, 0] * rows + cell[:, 1]
-    order = np.argsort(key, kind="stable")
-    key = key[order]
-    # Clip: circles beyond all positions overlap only empty cells.
-    column, row = np.clip(np.floor((centre - low) / side) + 1, 0, cell.max(axis=0) + 1).astype(int).T
-    first, last = np.maximum(row - 1, 0), np.minimum(row + 1, rows - 1)
-    begin = np.stack([np.searchsorted(key, (column + c) * rows + first, side="left") for c in (-1, 0, 1)], axis=1)
-    end = np.stack([np.searchsorted(key, (column + c) * rows + last, side="right") for c in (-1, 0, 1)], axis=1)
-    count = (end - begin).ravel()
-    circle = np.repeat(np.repeat(np.arange(len(centre)), 3), count)
-    place = order[np.arange(len(circle)) + np.repeat(begin.ravel() - np.cumsum(count) + count, count)]
-    near = np.sum((xy[place] - centre[circle]) ** 2, axis=1) <= reach[circle] ** 2
-    return circle[near], place[near]
+    places = scipy.spatial.KDTree(xy).query_ball_point(centre, radius + more_m + 1e-6)
+    circle = np.repeat(np.arange(len(centre)), [len(of) for of in places])
+    return circle, np.concatenate(places).astype(int)
 
 
 def pairs_along(
@@ -218,13 +201,6 @@ class Tree:
     radius_m: float
 
 
-class Crowns(NamedTuple):
-    """Ellipsoids about `centre` with half axes `half` (m)."""
-
-    centre: Float[np.ndarray, "trees 3"]
-    half: Float[np.ndarray, "trees 3"]
-
-
 class Leaves(NamedTuple):
     """Hits of leaves: index of the pulse, distance along its ray (m); mask of the pulses that ended there."""
 
@@ -233,12 +209,12 @@ class Leaves(NamedTuple):
     stopped: Bool[np.ndarray, "pulses"]
 
 
-def crowns(trees: Sequence[Tree]) -> Crowns:
-    """Return the crowns of `trees`."""
+def crowns(trees: Sequence[Tree]) -> tuple[Float[np.ndarray, "trees 3"], Float[np.ndarray, "trees 3"]]:
+    """Return centres and half axes (m) of the ellipsoidal crowns of `trees`."""
     upright = [(1 - _BARE) / 2 * t.height_m for t in trees]
     centre = [(*t.at_m, t.foot_m + t.height_m - up) for t, up in zip(trees, upright, strict=True)]
     half = [(t.radius_m, t.radius_m, up) for t, up in zip(trees, upright, strict=True)]
-    return Crowns(np.array(centre).reshape(-1, 3), np.array(half).reshape(-1, 3))
+    return np.array(centre).reshape(-1, 3), np.array(half).reshape(-1, 3)
 
 
 def under_crown(trees: Sequence[Tree], xy: Float[np.ndarray, "n 2"], margin_m: float) -> Bool[np.ndarray, "n"]:

@@ -6,19 +6,29 @@ from typing import Any
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Array, Float, Int, PRNGKeyArray
 
-from jaxphoto.block import Block, Start, Temperatures
+from jaxphoto.block import Block, Start, Temperatures, bent_cameras, exposures, mountings
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.cloud import Cloud
-from jaxphoto.collinearity import ExteriorOrientation
+from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.errors import BlockError
-from jaxphoto.georeferencing import Mount, RigCamera, StripBias, StripErrors, Trajectory
-from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
+from jaxphoto.georeferencing import Mount, RigCamera, StripBias, StripErrors, Trajectory, apparent_point
+from jaxphoto.observations import (
+    Attitudes,
+    CameraPositions,
+    ControlCoordinates,
+    Correlated,
+    Distances,
+    ImagePoints,
+    ImageState,
+    KnownParameters,
+    SurfaceRows,
+)
 from jaxphoto.short_repr import simulation_html, simulation_repr
 from jaxphoto.simulation.camera_changes import (
-    Circumstances,
     camera_motions,
     camera_steps,
     draw_changes,
@@ -39,14 +49,16 @@ from jaxphoto.simulation.flight import (
     relative_rows,
     rig_rows,
     rotate_cameras,
+    sensor_record,
     take_images,
 )
 from jaxphoto.simulation.plans import ConvergentPlan, FlightPlan
 from jaxphoto.simulation.points import TruePoints, scatter, thin_rays
 from jaxphoto.simulation.recipe import Assumed, Recipe, SimulatedBias, Triple, triple
 from jaxphoto.simulation.sampling import stream
-from jaxphoto.simulation.scan import Path, Scan, exposure_times, paths, recorded_on_path, scan
+from jaxphoto.simulation.scan import exposure_times, paths, recorded_on_path, scan
 from jaxphoto.simulation.scene import Terrain
+from jaxphoto.static_values import with_plain_arrays
 from jaxphoto.unknowns import FIXED, FREE, Unknowns
 
 # Control axes of each role; number of sample positions for the mean ground height.
@@ -103,15 +115,25 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     mounts = [recipe.mounts[name].truth if (name := recipe.mount_of(c)) else NO_MOUNT for c in flight.cameras]
     motions = camera_motions(flight.exterior, flight.motion.velocity, flight.motion.rate, mounts)
     biases = _true_biases(recipe, flight, seed)
-    flown = [] if recipe.lidar is None else paths(recipe, recipe.lidar, alone, height, seed)
-    cloud, trajectory, scanner, errors = _scanned(recipe, flown, terrain, seed)
+    flown = [] if recipe.lidar is None else paths(recipe, recipe.lidar, alone)
+    cloud = trajectory = scanner = errors = None
+    if recipe.lidar is not None:
+        cloud, trajectory, scanner, errors = scan(recipe.lidar, flown, terrain, _sigma(recipe.noise.lidar_m), seed)
     on_path = recipe.lidar is not None and recipe.lidar.same_trajectory
-    clock = exposure_times(flown, alone)[event] if on_path else _clock(recipe, event)
+    # Times per strip are sufficient unless cameras change.
+    clock = None
+    if on_path:
+        clock = exposure_times(flown, alone)[event]
+    elif (recipe.changes or recipe.temperature) and isinstance(recipe.plan, FlightPlan):
+        clock = recipe.plan.clock[event]
     times = flight.time if clock is None else clock
-    temperatures = _temperatures(recipe, times)
-    when = Circumstances(times, np.zeros(len(times)) if temperatures is None else np.asarray(temperatures.above))
+    cooling = recipe.temperature
+    temperatures = None if cooling is None else Temperatures(cooling.at(times), cooling.reference_c)
+    above = np.zeros(len(times)) if temperatures is None else np.asarray(temperatures.above)
     changes = draw_changes(recipe, flight, times, seed)
-    scene = scene._replace(rays=reproject_changing(recipe, flight, scene.rays, scene.xyz, motions, when, changes))
+    scene = scene._replace(
+        rays=reproject_changing(recipe, flight, scene.rays, scene.xyz, motions, times, above, changes)
+    )
     truth = Unknowns(
         {name: _numbers(camera.truth) for name, camera in recipe.cameras.items()},
         flight.exterior,
@@ -141,23 +163,6 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
         more=(*camera_steps(recipe, flight, times, start.unknowns), *rig_rows(recipe, flight), *relative),
     )  # fmt: skip
     return Simulation(block, truth, triple(recipe.datum_offset_m), terrain, cloud, trajectory, errors)
-
-
-def _scanned(recipe: Recipe, flown: list[Path], terrain: Terrain, seed: int) -> Scan | tuple[None, None, None, None]:
-    if recipe.lidar is None:
-        return None, None, None, None
-    return scan(recipe.lidar, flown, terrain, _sigma(recipe.noise.lidar_m), seed)
-
-
-def _clock(recipe: Recipe, event: Int[np.ndarray, "images"]) -> Float[np.ndarray, "images"] | None:
-    """Return the time of every exposure from the middle of the flight (s); None if times per strip are sufficient."""
-    changing = recipe.changes or recipe.temperature
-    return recipe.plan.clock[event] if changing and isinstance(recipe.plan, FlightPlan) else None
-
-
-def _temperatures(recipe: Recipe, times: Float[np.ndarray, "images"]) -> Temperatures | None:
-    cooling = recipe.temperature
-    return None if cooling is None else Temperatures(cooling.at(times), cooling.reference_c)
 
 
 def _seen(recipe: Recipe, flight: Flight, scene: TruePoints, seed: int) -> TruePoints:
@@ -287,3 +292,115 @@ def _sigma(values: Triple | None) -> np.ndarray:
 
 def _numbers(tree: InteriorOrientation | Mount | StripBias):
     return jax.tree.map(lambda value: np.asarray(value, float), tree)
+
+
+# New observations of a block: the same rows, computed from true parameters, with new noise of their sigmas.
+
+
+def remeasure_rows(rows: Any, block: Block, truth: Unknowns, key: PRNGKeyArray) -> Any:
+    """Return the rows with their observations under `truth`, plus normal noise of their sigmas.
+
+    Rows with joint covariances, and rows with parameters missing from `truth`, are not changed.
+    """
+    if isinstance(rows, Correlated | KnownParameters) or rows.block_parameters or rows.uses_interior or not len(rows):
+        return rows
+    missing = {what for what, _ in rows.indices()} - {"image", "point", *truth.tables}
+    if missing:
+        return rows
+    touched = [_touched(what, np.asarray(index), block, truth) for what, index in rows.indices()]
+    residual = jax.vmap(lambda row, of: row.residual(*of))(with_plain_arrays(rows), touched)
+    noise = jnp.asarray(rows.sigmas) * jax.random.normal(key, np.shape(rows.sigmas))
+    return rows.with_observation(jnp.asarray(rows.observation) - residual + noise)
+
+
+def _touched(what: str, index: np.ndarray, block: Block, truth: Unknowns) -> Any:
+    if what == "point":
+        return jnp.asarray(truth.points)[index]
+    if what != "image":
+        return jax.tree.map(lambda *v: jnp.stack(v)[index], *map(_floats, truth.tables[what].values()))
+    exterior, taken, parameters = truth.exterior, jax.tree.map(lambda v: jnp.asarray(v)[index], exposures(block)), {}
+    for kind, owners in truth.tables.items():
+        if not owners:
+            continue
+        table = jax.tree.map(lambda *v: jnp.stack([*v, jnp.zeros_like(v[0])]), *map(_floats, owners.values()))
+        place = {name: k for k, name in enumerate(owners)}
+        names = block.owners(type(next(iter(owners.values()))).owner)
+        at = np.array([place.get(name, len(place)) for name in names])[index]
+        parameters[kind] = jax.tree.map(lambda v: v[at], table)  # noqa: B023
+    position, rotation = (jnp.asarray(v)[index] for v in (exterior.position, exterior.camera_from_object))
+    states = ImageState
+    # Vectorise: `ImageState` is defined for a single image.
+    for _ in range(index.ndim):
+        states = jax.vmap(states)
+    return states(position, rotation, taken, parameters)
+
+
+def _floats(parameters: Any) -> Any:
+    return jax.tree.map(lambda v: jnp.asarray(v, float), parameters)
+
+
+def remeasure(block: Block, truth: Unknowns, key: PRNGKeyArray) -> Block:
+    """Replace every observation of `block` by its true value under `truth` plus normal noise of its sigma.
+
+    Image points, stations, attitudes, control, surfaces, distances and further rows are drawn independently. Check and
+    fixed coordinates are set to their true values; weighted priors and joint covariances are not changed. Pure and
+    differentiable in `truth`; use `vmap` over keys for many blocks at once. An adjustment should estimate `truth`.
+    """
+    keys = jax.random.split(key, 5)
+    draw = lambda k, value, sigma: value + jnp.asarray(sigma) * jax.random.normal(k, value.shape)  # noqa: E731
+    rows, points = block.image_points, jnp.asarray(truth.points)
+    stations, attitudes = _georeferenced(block, truth)
+    a, b = np.asarray(block.distances.points).reshape(-1, 2).T
+    length = jnp.sqrt(jnp.sum((points[a] - points[b]) ** 2, axis=1))
+    where = lambda x: (  # noqa: E731
+        x.image_points.xy, x.stations.value, x.attitudes.roll_pitch_yaw, x.control.value, x.distances.value,
+        x.check.value, x.fixed.value, x.surfaces.foot,
+    )  # fmt: skip
+    new = (
+        draw(keys[0], image_coordinates(block, truth), rows.sigma),
+        draw(keys[1], stations, block.stations.sigma),
+        draw(keys[2], attitudes, block.attitudes.sigma),
+        draw(keys[3], points[block.control.who, block.control.axis], block.control.sigma),
+        draw(keys[4], length, block.distances.sigma),
+        points[block.check.who, block.check.axis],
+        points[block.fixed.who, block.fixed.axis],
+        _feet(block.surfaces, truth, jax.random.fold_in(key, 5)),
+    )
+    further = (jax.random.fold_in(key, 6 + k) for k in range(len(block.more)))
+    more = tuple(remeasure_rows(rows, block, truth, k) for rows, k in zip(block.more, further, strict=True))
+    return dataclasses.replace(eqx.tree_at(where, block, new), more=more)
+
+
+def _feet(surfaces: SurfaceRows, truth: Unknowns, key: PRNGKeyArray) -> Float[Array, "rows 3"]:
+    """Return foot points on the surfaces with shift and boresight of the scanner, and noise along the normal."""
+    foot = jnp.asarray(truth.points)[surfaces.point]
+    rise = jnp.asarray(surfaces.sigma) * jax.random.normal(key, surfaces.sigma.shape)
+    if truth.scanner is not None:
+        shifts = jnp.stack([jnp.zeros(3), *truth.scanner.shifts.values()])[1:]
+        foot = foot + shifts[surfaces.strip] if len(shifts) else foot
+        rise = rise + jnp.asarray(surfaces.turn) @ truth.scanner.boresight
+    return foot + rise[:, None] * surfaces.normal
+
+
+def image_coordinates(block: Block, truth: Unknowns) -> Float[Array, "rows 2"]:
+    """Return image coordinates (mm, without noise) of every image row under `truth`."""
+    image, point = np.asarray(block.image_points.image), np.asarray(block.image_points.point)
+    camera = np.array(block.image_camera)[image]
+    exterior, points = jax.tree.map(jnp.asarray, (truth.exterior, truth.points))
+    xy, bent = jnp.zeros((len(image), 2)), bent_cameras(block, truth)
+    for name, interior in truth.interior.items():
+        of_camera = np.flatnonzero(camera == name)
+        eo = ExteriorOrientation(exterior.position[image[of_camera]], exterior.camera_from_object[image[of_camera]])
+        aim = jax.vmap(apparent_point, in_axes=(0, 0, None))(eo.position, points[point[of_camera]], block.corrections)
+        camera_of_row = None if bent is None else 0
+        cameras = interior if bent is None else jax.tree.map(lambda v: v[image[of_camera]], bent[name])  # noqa: B023
+        xy = xy.at[of_camera].set(jax.vmap(project, in_axes=(camera_of_row, 0, 0))(cameras, eo, aim))
+    return xy
+
+
+def _georeferenced(block: Block, truth: Unknowns) -> tuple[Float[Array, "stations"], Float[Array, "attitudes 3"]]:
+    """Return error-free GNSS and IMU observations."""
+    arrays = (truth.exterior, *mountings(block, truth), exposures(block))
+    exterior, mount, strip, exposure = jax.tree.map(jnp.asarray, arrays)
+    sensors, angles = jax.vmap(sensor_record)(exterior.position, exterior.camera_from_object, mount, strip, exposure)
+    return sensors[block.stations.who, block.stations.axis], angles[np.asarray(block.attitudes.image)]

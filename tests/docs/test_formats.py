@@ -7,7 +7,6 @@ import pytest
 
 from jaxphoto.extras.formats import CAMERAS_WRITTEN, CONTROL_FORMATS, EXPORTS, FORMATS, export, recognise
 from jaxphoto.io.camera_files import CAMERA_READERS
-from jaxphoto.io.clouds import cloud_reader
 from jaxphoto.io.exposures import files
 from jaxphoto.io.trajectory import is_sbet
 from tests import sound_files
@@ -43,7 +42,7 @@ def named(column):
 
 
 SBET = [("trajectory", end) for end in (".sbet", ".out") if is_sbet(Path(f"a{end}"))]
-CLOUDS = [("cloud", suffix) for suffix in cloud_reader.SUFFIXES]
+CLOUDS = [("cloud", suffix) for suffix in (".las", ".laz", ".csv")]
 DECLARED = {
     "read": [
         *(("convert", name) for name in FORMATS),
@@ -54,7 +53,6 @@ DECLARED = {
         ("trajectory", ".csv"),
         *CLOUDS,
         ("cloud", ".copc.laz"),
-        ("raster", "dsm"),
     ],
     "written": [
         ("convert", "block"),
@@ -63,8 +61,6 @@ DECLARED = {
         *SBET,
         ("trajectory", ".csv"),
         *CLOUDS,
-        ("raster", "dsm"),
-        ("raster", "orthophoto"),
     ],
 }
 

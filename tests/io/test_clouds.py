@@ -1,4 +1,4 @@
-"""Point clouds in LAS, LAZ, CSV and PLY: systems, units, filters, and refusals."""
+"""Point clouds in LAS, LAZ and CSV: systems, units, filters, and refusals."""
 
 import dataclasses
 import warnings
@@ -14,7 +14,6 @@ from jaxphoto.block import Frame
 from jaxphoto.cloud import Cloud
 from jaxphoto.io import clouds
 from jaxphoto.io.clouds import EVERY_CLASS
-from jaxphoto.io.clouds import cloud_source as chunked
 from tests.checked_types import unchecked
 
 LOCAL, GRID = Frame("local"), Frame("grid")
@@ -63,12 +62,10 @@ def same(a, b, tolerance=1e-9):
 @pytest.fixture(autouse=True)
 def small_chunks(monkeypatch):
     """Chunks that several of make up a file."""
-    for module in ("las", "tables", "cloud_writer"):
-        monkeypatch.setattr(f"jaxphoto.io.clouds.{module}.CHUNK", 300)
-    assert chunked.CHUNK > 10_000
+    monkeypatch.setattr("jaxphoto.io.clouds._CHUNK", 300)
 
 
-@pytest.mark.parametrize("name", ["c.las", "c.laz", "c.csv", "c.ply"])
+@pytest.mark.parametrize("name", ["c.las", "c.laz", "c.csv"])
 def test_clouds_round_trip(tmp_path, name):
     cloud = sample()
     clouds.write_cloud(cloud, tmp_path / name)
@@ -76,16 +73,14 @@ def test_clouds_round_trip(tmp_path, name):
     same(read, Cloud(read.xyz, cloud.classification, cloud.returns, cloud.time, read.strip, read.strips))
     np.testing.assert_allclose(read.xyz, cloud.xyz, rtol=0, atol=1e-9)
     assert [read.strips[k] for k in read.strip] == [cloud.strips[k] for k in cloud.strip]
-    np.testing.assert_allclose(clouds.extent(tmp_path / name), cloud.extent, atol=1e-9)
     assert [p.name for p in tmp_path.iterdir()] == [name]
 
 
 def test_missing_columns_are_none(tmp_path):
     bare = Cloud(sample(50).xyz)
-    for name in ("c.csv", "c.ply"):
-        clouds.write_cloud(bare, tmp_path / name)
-        read = clouds.read_cloud(tmp_path / name)
-        assert (read.classification, read.returns, read.time, read.strip, read.strips) == (None, None, None, None, ())
+    clouds.write_cloud(bare, tmp_path / "c.csv")
+    read = clouds.read_cloud(tmp_path / "c.csv")
+    assert (read.classification, read.returns, read.time, read.strip, read.strips) == (None, None, None, None, ())
     old = write_las(tmp_path / "old.las", bare.xyz, point_format=0)
     assert clouds.read_cloud(old).time is None
 
@@ -106,8 +101,6 @@ def test_filters(tmp_path, returns, classes):
     assert 0 < kept.sum() < len(cloud)
     np.testing.assert_allclose(read.xyz, cloud.xyz[kept], atol=1e-9)
     np.testing.assert_array_equal(read.time, cloud.time[kept])
-    parts = list(clouds.cloud_chunks(tmp_path / "c.laz", classes=classes, returns=returns))
-    assert max(map(len, parts)) <= 300
 
 
 def test_strips_without_points_are_left_out(tmp_path):
@@ -129,16 +122,11 @@ def test_withheld_points_are_kept_in_written_files(tmp_path, kind):
     np.testing.assert_allclose(read.xyz, cloud.xyz[~withheld], atol=1e-9)
     assert read.withheld is None
     step = np.array([0.5, -0.25, 0.125])
-    # The whole file moves; a cloud that was read has no place for them.
-    for write, moved in (
-        (lambda: clouds.rewrite_cloud(path, new, lambda part: part.xyz + step), np.ones(500, bool)),
-        (lambda: clouds.write_cloud(dataclasses.replace(read, xyz=read.xyz + step), new, like=path), ~withheld),
-    ):
-        write()
-        written = laspy.read(new)
-        np.testing.assert_allclose(written.xyz, cloud.xyz + moved[:, None] * step, atol=1e-9)
-        for name, values in said.items():
-            np.testing.assert_array_equal(written[name], values)
+    clouds.rewrite_cloud(path, new, lambda part: part.xyz + step)
+    written = laspy.read(new)
+    np.testing.assert_allclose(written.xyz, cloud.xyz + step, atol=1e-9)
+    for name, values in said.items():
+        np.testing.assert_array_equal(written[name], values)
 
 
 def test_withheld_points_outside_the_system_stay(tmp_path):
@@ -178,37 +166,6 @@ def test_units_are_those_of_the_system(tmp_path, crs, plane, height):
     xyz = sample(100, middle=(600_000.0, 800_000.0, 400.0)).xyz
     path = write_las(tmp_path / "c.las", xyz, crs)
     np.testing.assert_allclose(clouds.read_cloud(path).xyz, xyz * [plane, plane, height], rtol=1e-15, atol=1e-9)
-    # What the user says counts for all.
-    np.testing.assert_allclose(clouds.read_cloud(path, unit="us_ft").xyz, xyz * US_FT, rtol=1e-15, atol=1e-9)
-    if crs is not None:
-        system = clouds.cloud_system(path)
-        assert {axis.unit_name for axis in system.plane.axis_info} == {"metre"}
-        place = Transformer.from_crs(CRS(crs).to_2d(), CRS(crs).geodetic_crs.to_2d(), always_xy=True)
-        here = Transformer.from_crs(system.plane, system.plane.geodetic_crs, always_xy=True)
-        np.testing.assert_allclose(here.transform(*(xyz * plane)[0, :2]), place.transform(*xyz[0, :2]), atol=1e-11)
-
-
-def geo_keys(**keys):
-    """The GeoTIFF directory of these key numbers."""
-    rows = [(1, 1, 0, len(keys)), *((int(k[1:]), 0, 1, v) for k, v in sorted(keys.items()))]
-    return laspy.VLR("LASF_Projection", 34735, "", np.array(rows, "<u2").tobytes())
-
-
-@pytest.mark.parametrize(
-    ("keys", "plane", "height"),
-    [
-        ({"k3072": 2264}, US_FT, US_FT),
-        ({"k3072": 32722, "k4099": 9003}, 1.0, US_FT),
-        ({"k3072": 2994, "k4096": 5703}, FT, 1.0),
-        ({"k3072": 2994, "k4096": 5703, "k4099": 9002}, FT, FT),
-        ({"k3072": 32767, "k3076": 9003}, US_FT, US_FT),
-        ({"k3076": 9002, "k4099": 9001}, FT, 1.0),
-    ],
-)
-def test_units_of_geotiff_keys(tmp_path, keys, plane, height):
-    xyz = sample(100, middle=(600_000.0, 800_000.0, 400.0)).xyz
-    path = write_las(tmp_path / "c.las", xyz, vlrs=[geo_keys(**keys)], point_format=3)
-    np.testing.assert_allclose(clouds.read_cloud(path).xyz, xyz * [plane, plane, height], rtol=1e-15, atol=1e-9)
 
 
 def topocentric(longitude, latitude, height, origin=ORIGIN):
@@ -244,9 +201,6 @@ def test_into_the_frame_of_a_block(tmp_path):
     path = write_las(tmp_path / "utm.laz", cloud.xyz, "EPSG:32722")
     read = clouds.read_cloud(path, UTM)
     np.testing.assert_allclose(read.xyz, truth, rtol=0, atol=1e-6)
-    ends = clouds.extent(path, UTM)
-    assert (ends[0] <= read.extent[0] + 1e-3).all() and (ends[1] >= read.extent[1] - 1e-3).all()
-    assert np.abs(ends - read.extent).max() < 20
     neighbour = np.stack([*Transformer.from_crs(32722, 32723, always_xy=True).transform(*cloud.xyz[:, :2].T)], axis=1)
     path = write_las(tmp_path / "other.laz", np.column_stack([neighbour, cloud.xyz[:, 2]]), "EPSG:32723", 1e-4)
     np.testing.assert_allclose(clouds.read_cloud(path, UTM).xyz, truth, rtol=0, atol=3e-4)
@@ -257,13 +211,6 @@ def test_into_the_frame_of_a_block(tmp_path):
     )
     # A grid is taken as it stands.
     np.testing.assert_allclose(clouds.read_cloud(tmp_path / "utm.laz", GRID).xyz, cloud.xyz, atol=1e-9)
-    # Heights that count in feet are metres before they are heights.
-    feet = write_las(tmp_path / "feet.las", cloud.xyz / [1, 1, US_FT], "EPSG:32722", 1e-4, vlrs=[])
-    las = laspy.read(feet)
-    las.header.vlrs = laspy.vlrs.vlrlist.VLRList([geo_keys(k3072=32722, k4099=9003)])
-    las.header.global_encoding.wkt = False
-    las.write(feet)
-    np.testing.assert_allclose(clouds.read_cloud(feet, UTM).xyz, truth, rtol=0, atol=1e-4)
 
 
 def test_a_foot_system_comes_to_a_metric_block(tmp_path):
@@ -279,43 +226,9 @@ def test_datums_without_a_known_way_are_warned_of(tmp_path):
         clouds.read_cloud(path, Frame("epsg", 26910, None, "true", (-123.0, 44.0, 0.0)))
 
 
-@pytest.mark.parametrize("frame", [None, UTM])
-def test_written_like_another_file(tmp_path, frame):
-    """Coordinates change, and nothing else: units, scale, system and extra dimensions stay."""
-    crs, unit = ("EPSG:2264", US_FT) if frame is None else ("EPSG:32722", 1.0)
-    cloud = sample()
-    xyz = cloud.xyz / unit
-    header = laspy.LasHeader(point_format=7, version="1.4")
-    header.scales, header.offsets = [0.001] * 3, np.floor(xyz.mean(axis=0))
-    header.add_crs(CRS(crs))
-    header.add_extra_dim(laspy.ExtraBytesParams("amplitude", "f4"))
-    las = laspy.LasData(header)
-    las.x, las.y, las.z = xyz.T
-    las.classification, las.gps_time = cloud.classification, cloud.time
-    las["amplitude"] = np.arange(len(cloud), dtype="f4")
-    las.red = np.arange(len(cloud), dtype="u2")
-    las.write(tmp_path / "a.laz")
-    read = clouds.read_cloud(tmp_path / "a.laz", frame)
-    moved = Cloud(read.xyz + np.array([0.5, -0.25, 0.125]), read.classification, read.returns, read.time)
-    clouds.write_cloud(moved, tmp_path / "b.laz", like=tmp_path / "a.laz", frame=frame)
-    new = laspy.read(tmp_path / "b.laz")
-    np.testing.assert_array_equal(new["amplitude"], las["amplitude"])
-    np.testing.assert_array_equal(new.red, las.red)
-    assert new.header.parse_crs() == las.header.parse_crs()
-    np.testing.assert_array_equal(new.header.scales, las.header.scales)
-    np.testing.assert_allclose(clouds.read_cloud(tmp_path / "b.laz", frame).xyz, moved.xyz, atol=0.6e-3 * unit)
-    if frame is None:
-        np.testing.assert_allclose(new.xyz * unit, moved.xyz, atol=0.6e-3 * unit)
-    with pytest.raises(InputError, match=r"500 points.*1000"):
-        clouds.write_cloud(moved.take(np.arange(500)), tmp_path / "c.laz", like=tmp_path / "a.laz", frame=frame)
-    with pytest.raises(InputError, match=r"2000 points.*1000"):
-        clouds.write_cloud(moved.take(np.arange(2000) % 1000), tmp_path / "c.laz", like=tmp_path / "a.laz", frame=frame)
-    assert not (tmp_path / "c.laz").exists()
-
-
-@pytest.mark.parametrize("name", ["c.laz", "c.csv", "c.ply"])
+@pytest.mark.parametrize("name", ["c.laz", "c.csv"])
 @pytest.mark.parametrize(
-    ("frame", "said", "unit"), [(None, {}, 1.0), (None, {"unit": "ft"}, FT), (UTM, {"epsg": 32722}, 1.0)]
+    ("frame", "said", "unit"), [(None, {}, 1.0), (None, {"epsg": 2994}, FT), (UTM, {"epsg": 32722}, 1.0)]
 )
 def test_rewritten_part_by_part_in_its_own_system_and_units(tmp_path, name, frame, said, unit):
     cloud = sample()
@@ -330,7 +243,7 @@ def test_rewritten_part_by_part_in_its_own_system_and_units(tmp_path, name, fram
 
     new = tmp_path / f"new{name[1:]}"
     clouds.rewrite_cloud(tmp_path / name, new, moved, frame=frame, **said)
-    assert sum(met) == len(cloud) and max(met) <= 300
+    assert sum(met) == len(cloud) and max(met) <= (1000 if name == "c.csv" else 300)
     before, after = (clouds.read_cloud(f, frame, classes=EVERY_CLASS, **said) for f in (tmp_path / name, new))
     np.testing.assert_allclose(after.xyz, before.xyz + step, atol=0.6e-3 * unit)
     same(after, dataclasses.replace(before, xyz=after.xyz))
@@ -353,7 +266,6 @@ def test_failed_writes_leave_nothing(tmp_path):
         ("no farther", lambda: clouds.rewrite_cloud(source, tmp_path / "d.laz", moved)),
         ("of one kind", lambda: clouds.rewrite_cloud(source, tmp_path / "d.csv", lambda part: part.xyz)),
         (r"\.laz", lambda: clouds.write_cloud(sample(10), tmp_path / "c.txt")),
-        ("both must be", lambda: clouds.write_cloud(sample(), tmp_path / "d.csv", like=source)),
     ):
         with pytest.raises(InputError, match=message):
             write()
@@ -363,7 +275,7 @@ def test_failed_writes_leave_nothing(tmp_path):
 def test_written_in_the_system_of_the_frame(tmp_path):
     truth = sample()
     local = Cloud(UTM.map.local(truth.xyz))
-    for name in ("c.laz", "c.csv", "c.ply"):
+    for name in ("c.laz", "c.csv"):
         clouds.write_cloud(local, tmp_path / name, frame=UTM)
         read = clouds.read_cloud(tmp_path / name, epsg=None if name == "c.laz" else 32722)
         np.testing.assert_allclose(read.xyz, truth.xyz, rtol=0, atol=0.6e-3)
@@ -399,16 +311,6 @@ def test_real_files_are_the_same_packed_or_not(data_dir):
     assert len(las) == 1065 and len(las.strips) == 9
 
 
-def test_real_feet_without_a_system_are_recognised(data_dir):
-    path = data_dir / "lidar" / "simple.las"
-    within = np.array([[193_800.0, 258_800.0], [194_700.0, 260_100.0]])
-    with pytest.raises(
-        InputError, match=r"X 635619\.8 to 638982\.6.*X 193800\.0.*--cloud-unit ft or --cloud-unit us_ft"
-    ):
-        clouds.read_cloud(path, LOCAL, within=within)
-    assert len(clouds.read_cloud(path, LOCAL, within=within, unit="ft"))
-
-
 # What cannot be used
 
 
@@ -436,17 +338,8 @@ def test_files_that_are_cut_off(tmp_path, kind):
     assert "cut off" in complaint(cut)
 
 
-def test_points_outside_the_header_show_damage(tmp_path):
-    path = write_las(tmp_path / "c.las", sample(500).xyz)
-    content = bytearray(path.read_bytes())
-    content[-30 * 100 + 3] ^= 0x40
-    path.write_bytes(content)
-    assert "outside the extent" in complaint(path)
-
-
 def test_invalid_files_are_refused(tmp_path):
     assert "no file" in complaint(tmp_path / "none.las")
-    assert "folder" in complaint(tmp_path)
     (tmp_path / "c.xyz").write_text("1 2 3\n")
     assert ".laz" in complaint(tmp_path / "c.xyz")
     (tmp_path / "c.las").write_text("no cloud at all " * 50)
@@ -455,8 +348,6 @@ def test_invalid_files_are_refused(tmp_path):
     assert "no points" in complaint(tmp_path / "empty.las")
     (tmp_path / "empty.csv").write_text("X_m,Y_m,Z_m\n")
     assert "no points" in complaint(tmp_path / "empty.csv")
-    with pytest.raises(InputError, match="no points"):
-        clouds.extent(tmp_path / "empty.csv")
 
 
 def test_systems_that_do_not_fit(tmp_path):
@@ -468,11 +359,8 @@ def test_systems_that_do_not_fit(tmp_path):
     assert "degrees" in complaint(degrees)
     assert "degrees" in complaint(degrees, GRID)
     assert "99999 is unknown" in complaint(bare, UTM, epsg=99999)
-    assert "not a map or geographic system" in complaint(bare, epsg=4978)
-    with pytest.raises(InputError, match="'yard' is unknown"):
-        clouds.read_cloud(bare, unit="yard")
+    assert "not a map system" in complaint(bare, epsg=4978)
     assert "outside the area" in complaint(utm, UTM, epsg=4326)
-    assert "outside the area" in complaint(utm, UTM, epsg=4326, within=np.array([[-1e3, -1e3], [1e3, 1e3]]))
     # EGM96 needs a geoid; where it is on this computer, it lifts the points by metres.
     egm = write_las(tmp_path / "egm.las", xyz, "EPSG:32722+5773")
     flat = clouds.read_cloud(egm, UTM, epsg=32722).xyz
@@ -495,53 +383,15 @@ def test_a_system_that_proj_does_not_know(tmp_path):
     assert len(clouds.read_cloud(path, UTM, epsg=32722)) == 1000
 
 
-def test_records_after_the_points_are_kept(tmp_path):
-    """A system may stand there as well, and is written again."""
-    las = laspy.read(write_las(tmp_path / "c.laz", sample().xyz))
-    las.evlrs = laspy.vlrs.vlrlist.VLRList(
-        [laspy.VLR("LASF_Projection", 2112, "", CRS(2994).to_wkt().encode() + b"\0")]
-    )
-    las.write(tmp_path / "c.laz")
-    read = clouds.read_cloud(tmp_path / "c.laz")
-    np.testing.assert_allclose(read.xyz, sample().xyz * FT, rtol=1e-15, atol=1e-9)
-    clouds.write_cloud(read, tmp_path / "d.laz", like=tmp_path / "c.laz")
-    np.testing.assert_allclose(clouds.read_cloud(tmp_path / "d.laz").xyz, read.xyz, atol=1e-9)
-
-
-def test_coordinates_that_a_scale_cannot_count(tmp_path):
-    path = write_las(tmp_path / "c.las", sample().xyz)
-    far = Cloud(sample().xyz + np.array([1e7, 0, 0]))
-    with pytest.raises(InputError, match=r"c\.las has the resolution 0\.001"):
-        clouds.write_cloud(far, tmp_path / "d.las", like=path)
-
-
-@pytest.mark.parametrize("name", ["c.las", "c.csv", "c.ply"])
-def test_clouds_off_the_block_are_refused(tmp_path, name):
-    cloud = sample(middle=(600_000.0, 800_000.0, 0.0))
-    clouds.write_cloud(Cloud(cloud.xyz), tmp_path / name)
-    away = np.array([[0.0, 0.0], [1000.0, 2000.0]])
-    (x0, y0, _), (x1, y1, _) = cloud.extent
-    message = complaint(tmp_path / name, LOCAL, within=away)
-    assert f"X {x0:.1f} to {x1:.1f}, Y {y0:.1f} to {y1:.1f} m" in message
-    assert "X 0.0 to 1000.0, Y 0.0 to 2000.0 m" in message and "unit" not in message
-    for unit, factor in (("ft", FT), ("us_ft", US_FT)):
-        middle = np.array([600_000.0, 800_000.0]) * factor
-        message = complaint(tmp_path / name, LOCAL, within=np.array([middle - 100, middle + 100]))
-        assert f"--cloud-unit {unit}" in message
-    message = complaint(tmp_path / name, LOCAL, within=cloud.extent[:, :2], unit="ft")
-    assert "--cloud-unit m)" in message or "--cloud-unit m " in message
-
-
-def test_empty_selections_list_classes_and_returns(tmp_path):
+def test_empty_selections_are_refused(tmp_path):
     cloud = sample()
     clouds.write_cloud(cloud, tmp_path / "c.laz")
     message = complaint(tmp_path / "c.laz", classes=[3, 9])
-    counts = np.bincount(cloud.classification)
-    assert "class 3, 9" in message and f"{counts[2]} of class 2" in message and f"{counts[6]} of class 6" in message
-    clouds.write_cloud(cloud.take(cloud.returns[:, 0] > 1), tmp_path / "d.laz")
-    message = complaint(tmp_path / "d.laz", returns="first", classes=[2])
-    n = ((cloud.returns == [2, 3]).all(axis=1)).sum()
-    assert f"{n} of return 2 of 3" in message and "of class 2" in message
+    assert "no points of these classes and returns;" in message
+    (x0, y0, _), (x1, y1, _) = cloud.extent
+    message = complaint(tmp_path / "c.laz", within=np.array([[0.0, 0.0], [1000.0, 2000.0]]))
+    assert f"X {x0:.1f} to {x1:.1f}, Y {y0:.1f} to {y1:.1f} m" in message
+    assert "X 0.0 to 1000.0, Y 0.0 to 2000.0 m" in message
     clouds.write_cloud(Cloud(cloud.xyz), tmp_path / "bare.csv")
     assert "no classification" in complaint(tmp_path / "bare.csv", classes=[2])
     assert "no return numbers" in complaint(tmp_path / "bare.csv", returns="last")
@@ -549,41 +399,25 @@ def test_empty_selections_list_classes_and_returns(tmp_path):
         clouds.read_cloud(tmp_path / "c.laz", returns="every")
 
 
-# Tables and PLY
-
-
-def test_tables_as_spreadsheets_write_them(tmp_path):
-    path = tmp_path / "c.csv"
-    path.write_text(
-        "# survey\n\nstrip;X_m; Y_m;Z_m;note\nnorth;1,5;2,5;3,25;a\n\n# more\nsouth;4,5;5,5;6,5;\n", "utf-8-sig"
-    )
-    read = clouds.read_cloud(path)
-    np.testing.assert_array_equal(read.xyz, [[1.5, 2.5, 3.25], [4.5, 5.5, 6.5]])
-    assert read.strips == ("north", "south") and read.strip.tolist() == [0, 1]
+# Tables
 
 
 @pytest.mark.parametrize(
     ("row", "says"),
     [
-        ("1.0,two,3.0,2", "Y_m is 'two'"),
-        ("1.0,2.0,inf,2", "Z_m is 'inf'"),
-        ("1.0,2.0", "Z_m is ''"),
+        ("1.0,two,3.0,2", "Y_m"),
+        ("1.0,2.0,inf,2", "Z_m"),
+        ("1.0,2.0", "classification is empty"),
         ("1.0,2.0,3.0,2,5", "5 cells"),
-        ("1.0,2.0,3.0,300", "classification is '300'"),
-        ("1.0,2.0,3.0,2.5", "classification is '2.5'"),
+        ("1.0,2.0,3.0,300", "classification is 300"),
+        ("1.0,2.0,3.0,2.5", "classification is 2.5"),
     ],
 )
 def test_faulty_rows_are_named(tmp_path, row, says):
-    """Beyond the first chunk, after a comment and an empty line; in a PLY file in text likewise."""
+    """After a comment and an empty line."""
     rows = ["X_m,Y_m,Z_m,classification", "# a comment", "", *["1.0,2.0,3.0,2"] * 400, row, "1.0,2.0,3.0,2"]
     (tmp_path / "c.csv").write_text("\n".join(rows))
     assert f"c.csv, row 404: {says}" in complaint(tmp_path / "c.csv")
-    if says != "5 cells":
-        header = ["ply", "format ascii 1.0", "element vertex 402", *map("property double {}".format, PLY_FIELDS)]
-        ply = [*header, "end_header", *(r.replace(",", " ") for r in rows[3:])]
-        (tmp_path / "c.ply").write_text("\n".join(ply))
-        where = says if says != "Z_m is ''" else "Z_m"
-        assert f"c.ply, row {404 - 3 + len(header) + 1}: {where}" in complaint(tmp_path / "c.ply")
 
 
 def test_invalid_tables_are_refused(tmp_path):
@@ -594,71 +428,6 @@ def test_invalid_tables_are_refused(tmp_path):
     for rows in (0, 3000):
         path.write_bytes(b"X_m,Y_m,Z_m\n" + b"1,2,3\n" * rows + b"\xff\xfe,2,3\n")
         assert "UTF-8" in complaint(path)
-
-
-PLY_FIELDS = ("x", "y", "z", "classification")
-PLY = """ply
-format {} 1.0
-comment made by hand
-obj_info nothing
-element vertex {}
-property float nx
-property {} x
-property {} y
-property {} z
-property uchar scalar_Classification
-element face 1
-property list uchar int vertex_indices
-end_header
-"""
-
-
-@pytest.mark.parametrize("order", ["ascii", "binary_little_endian", "binary_big_endian"])
-@pytest.mark.parametrize("kind", ["float", "double"])
-def test_ply_of_all_kinds(tmp_path, order, kind):
-    xyz = np.round(sample(700, middle=(100.0, 200.0, 50.0)).xyz, 2)
-    classes = np.arange(700) % 7
-    path = tmp_path / "c.ply"
-    header = PLY.format(order, 700, kind, kind, kind).encode()
-    sign = ">" if "big" in order else "<"
-    if order == "ascii":
-        lines = [f"0.5 {x!r} {y!r} {z!r} {c}" for (x, y, z), c in zip(xyz.tolist(), classes, strict=True)]
-        path.write_bytes(header + "\n".join([*lines, "3 0 1 2", ""]).encode())
-    else:
-        number = sign + ("f4" if kind == "float" else "f8")
-        fields = [("nx", sign + "f4"), ("x", number), ("y", number), ("z", number), ("c", "u1")]
-        records = np.zeros(700, fields)
-        records["x"], records["y"], records["z"] = xyz.T
-        records["c"] = classes
-        path.write_bytes(header + records.tobytes() + b"\x03" + np.array([0, 1, 2], sign + "i4").tobytes())
-    read = clouds.read_cloud(path)
-    tolerance = 0.0 if kind == "double" or order == "ascii" else 1e-5 * 3
-    np.testing.assert_allclose(read.xyz, xyz, rtol=0, atol=tolerance)
-    np.testing.assert_array_equal(read.classification, classes)
-    # Cut off, and with a vertex that is nowhere.
-    content = path.read_bytes()
-    path.write_bytes(content[: len(content) * 2 // 3])
-    complaint(path)
-    assert order == "ascii" or "cut off" in complaint(path)
-    xyz[456, 1] = np.nan
-    clouds.write_cloud(Cloud(xyz), path)
-    assert "vertex 457: Y_m" in complaint(path)
-
-
-def test_ply_headers_that_are_invalid(tmp_path):
-    path, xyz = tmp_path / "c.ply", "".join(f"property float {axis}\n" for axis in "xyz")
-    for text, says in (
-        ("solid\n", "does not begin"),
-        ("ply\nformat ascii 1.0\nelement vertex 1\nproperty float x\nend_header\n1\n", "no vertices with x, y and z"),
-        (f"ply\nelement vertex 1\n{xyz}end_header\n", "no format"),
-        ("ply\nformat ascii 1.0\nelement vertex 1\nproperty list uchar int x\n", "row 4"),
-        (f"ply\nformat ascii 1.0\nelement vertex 0\n{xyz}end_header\n", "no points"),
-        (f"ply\nformat ascii 1.0\nelement vertex 3\n{xyz}end_header\n1 2 3\n4 5 6\n", "promises 3 points"),
-        ("ply\nformat ascii 1.0\n", "header has no end"),
-        (f"ply\nformat ascii 1.0\nelement face 1\nelement vertex 1\n{xyz}end_header\n", "vertices first"),
-    ):
-        path.write_text(text)
-        assert says in complaint(path)
 
 
 # COPC
@@ -681,12 +450,3 @@ def test_copc_is_read_and_rewritten_as_laz(tmp_path):
     ):
         with pytest.raises(InputError, match=r"e\.copc\.laz: COPC is read only"):
             write()
-
-
-# Damaged files
-
-
-@pytest.mark.parametrize("kind", ["las", "laz"])
-def test_nonfinite_times_are_refused(tmp_path, kind):
-    time = np.where(np.arange(1000) == 700, np.nan, 5.0)
-    assert "no finite time" in complaint(write_las(tmp_path / f"c.{kind}", sample().xyz, gps_time=time))

@@ -56,10 +56,6 @@ def test_a_failed_global_test_is_reported_and_kept_with_the_camera(results, monk
     code, out, _ = run(monkeypatch, capsys, "camera", results / "results", tmp_path / "camera.toml")
     assert code == 0 and said in out
     assert said in read_camera_file(tmp_path / "camera.toml").note
-    code, _, error = run(
-        monkeypatch, capsys, "tables", results / "results", "--to", "csv", "--out", tmp_path / "tables"
-    )
-    assert code == 0 and said in " ".join(error.split())
     # As prior information of another block, from the results or the camera file.
     block = tmp_path / "later"
     write_block(simulated("cross").block, block)

@@ -4,7 +4,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scipy.interpolate import LinearNDInterpolator
 from scipy.optimize import brentq
 from scipy.spatial import ConvexHull, cKDTree
 from scipy.stats import norm
@@ -12,13 +11,13 @@ from scipy.stats import norm
 from jaxphoto import InputError
 from jaxphoto.cloud import Cloud
 from jaxphoto.lidar import HeightFlag, HeightSettings, heights_at, index_cloud
-from jaxphoto.lidar.height_estimate import REFUSED, normal_equivalent
+from jaxphoto.lidar.heights import REFUSED, normal_equivalent
 from jaxphoto.lidar.sight import surrounded
 from tests.checked_types import unchecked
 from tests.lidar.clouds import SURFACES, gable, ground, places_over, read_autzen
 from tests.marks import slow_but
 
-METHODS = ("idw", "plane", "tin", "local")
+METHODS = ("plane", "local")
 # Small horizontal errors, so that few points tell the surface and few programs are compiled.
 EXACT = HeightSettings(sigma_z_m=0.05, sigma_xy_m=0.05)
 ALL = HeightSettings(sigma_z_m=0.05, sigma_xy_m=0.05, refuse=HeightFlag.OK)
@@ -35,16 +34,6 @@ def neighbours(xyz: np.ndarray, places: np.ndarray, k: int) -> tuple[np.ndarray,
     return distance[:, :k], index[:, :k], distance[:, k] > distance[:, k - 1]
 
 
-def test_idw_of_real_cloud_is_that_of_a_tree(autzen: np.ndarray) -> None:
-    places = places_over(autzen)
-    found = heights_at(index_cloud(autzen), places, "idw", ALL)
-    distance, index, sole = neighbours(autzen, places, 8)
-    weight = distance**-2.0
-    expected = np.sum(weight * autzen[index, 2], axis=1) / np.sum(weight, axis=1)
-    assert sole.mean() > 0.999
-    np.testing.assert_allclose(found.z[sole], expected[sole], rtol=0, atol=1e-9)
-
-
 def test_plane_of_real_cloud_is_that_of_lstsq(autzen: np.ndarray) -> None:
     places = places_over(autzen)
     found = heights_at(index_cloud(autzen), places, "plane", EXACT)
@@ -55,13 +44,6 @@ def test_plane_of_real_cloud_is_that_of_lstsq(autzen: np.ndarray) -> None:
         near = autzen[index[k]]
         rows = np.column_stack([np.ones(8), near[:, :2] - places[k]])
         assert abs(np.linalg.lstsq(rows, near[:, 2])[0][0] - found.z[k]) < 1e-9
-
-
-def test_heights_at_points_themselves_are_theirs() -> None:
-    xyz = ground(lambda x, y: 0.3 * x, 1.0, 0.05, 0.0, 40.0)
-    inner = xyz[(np.abs(xyz[:, :2] - 20) < 12).all(axis=1)]
-    for method in ("idw", "tin"):
-        np.testing.assert_allclose(heights_at(Cloud(xyz), inner[:, :2], method, ALL).z, inner[:, 2], atol=1e-9)
 
 
 def test_a_place_is_surrounded_where_its_neighbours_hull_holds_it() -> None:
@@ -90,22 +72,6 @@ def test_a_height_at_a_laser_point_is_told() -> None:
         assert not heights_at(Cloud(xyz), inner[:, :2], method, EXACT).flagged(HeightFlag.EDGE).mean() > 0.01
 
 
-def test_radius_takes_all_points_within() -> None:
-    xyz = ground(lambda x, y: 0.2 * x - 0.1 * y, 2.0, 0.05, 0.0, 40.0)
-    places = np.random.default_rng(2).uniform(5, 35, (60, 2))
-    tree = cKDTree(xyz[:, :2])
-    settings = HeightSettings(radius_m=3.0, sigma_z_m=0.05, sigma_xy_m=0.0, refuse=HeightFlag.OK)
-    plane, idw = (heights_at(Cloud(xyz), places, method, settings) for method in ("plane", "idw"))
-    for k, place in enumerate(places):
-        near = xyz[tree.query_ball_point(place, 3.0)]
-        offset = near[:, :2] - place
-        rows = np.column_stack([np.ones(len(near)), offset])
-        weight = np.sum(offset**2, axis=1) ** -1.0
-        assert plane.count[k] == len(near)
-        assert abs(plane.z[k] - np.linalg.lstsq(rows, near[:, 2])[0][0]) < 1e-9
-        assert abs(idw.z[k] - weight @ near[:, 2] / weight.sum()) < 1e-9
-
-
 def test_local_is_a_weighted_quadratic() -> None:
     xyz = ground(lambda x, y: 2 * np.sin(x / 9) * np.cos(y / 11), 1.0, 0.02, 0.0, 40.0)
     places = np.random.default_rng(3).uniform(8, 32, (60, 2))
@@ -124,7 +90,7 @@ def test_what_the_lidar_has_in_common_is_added() -> None:
     grid = index_cloud(ground(SURFACES["plane"], 1.0, 0.15, 0.5, 60.0))
     places = np.random.default_rng(1).uniform(5, 55, (60, 2))
     one, both = (
-        heights_at(grid, places, "idw", HeightSettings(sigma_xy_m=0.05, sigma_systematic_m=s)) for s in (0.0, 0.2)
+        heights_at(grid, places, "plane", HeightSettings(sigma_xy_m=0.05, sigma_systematic_m=s)) for s in (0.0, 0.2)
     )
     np.testing.assert_allclose(both.sigma, np.hypot(one.sigma, 0.2), rtol=1e-12)
 
@@ -176,10 +142,10 @@ def test_walls_and_ridges_are_refused_and_their_sides_are_not() -> None:
     y = np.random.default_rng(5).uniform(20, 80, 60)
     for height, middle in ((wall, 50.0), (gable, 56.0)):
         cloud = Cloud(ground(height, 4.0, 0.02, 0.03, 100.0))
-        at = heights_at(cloud, np.column_stack([np.full(60, middle), y]), "idw", settings)
+        at = heights_at(cloud, np.column_stack([np.full(60, middle), y]), "plane", settings)
         assert at.flagged(HeightFlag.BREAKLINE).mean() > 0.9
         assert np.isnan(at.z[at.flagged(HeightFlag.BREAKLINE)]).all()
-        aside = heights_at(cloud, np.column_stack([np.full(60, middle + 4), y]), "idw", settings)
+        aside = heights_at(cloud, np.column_stack([np.full(60, middle + 4), y]), "plane", settings)
         assert np.isnan(aside.z).mean() < 0.05
 
 
@@ -207,8 +173,8 @@ def test_few_points_and_bad_questions() -> None:
     line = Cloud(np.column_stack([np.arange(40.0), np.arange(40.0), np.zeros(40)]))
     for method in METHODS:
         assert heights_at(line, np.array([[20.2, 20.3]]), method, EXACT).flag[0]
-    assert len(heights_at(three, np.zeros((0, 2)), "idw", EXACT)) == 0
-    with pytest.raises(InputError, match="choose one of idw, plane, tin, local"), unchecked():
+    assert len(heights_at(three, np.zeros((0, 2)), "plane", EXACT)) == 0
+    with pytest.raises(InputError, match="choose one of plane, local"), unchecked():
         heights_at(three, np.zeros((1, 2)), "kriging")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="two columns"), unchecked():
         heights_at(three, np.zeros((1, 3)))
@@ -222,7 +188,7 @@ LIDARS = [(0.5, 0.15, 0.5), (4.0, 0.02, 0.05)]
 
 
 @pytest.mark.parametrize("lidar", slow_but(LIDARS[:1], LIDARS), ids=str)
-@pytest.mark.parametrize("method", ("idw", "plane", "tin", "local"))
+@pytest.mark.parametrize("method", METHODS)
 def test_errors_are_within_the_standard_deviation(method: str, lidar: tuple[float, float, float]) -> None:
     density, sigma_z, sigma_xy = lidar
     settings = HeightSettings(sigma_z_m=sigma_z, sigma_xy_m=sigma_xy)
@@ -240,29 +206,3 @@ def test_errors_are_within_the_standard_deviation(method: str, lidar: tuple[floa
     assert abs(np.mean(list(within.values())) - 0.95) < 0.02, within
     assert min(within.values()) > 0.92, within
     assert max(within.values()) < 0.98, within
-
-
-@pytest.mark.slow
-def test_tin_of_real_cloud_is_that_of_the_whole_triangulation(data_dir: Path) -> None:
-    autzen = read_autzen(data_dir)
-    places = places_over(autzen)
-    found = heights_at(Cloud(autzen), places, "tin", HeightSettings(sigma_z_m=0.05, sigma_xy_m=0.05))
-    # About their middle: unreduced map coordinates cost SciPy's triangulation its last digits.
-    middle = autzen[:, :2].mean(axis=0)
-    expected = LinearNDInterpolator(autzen[:, :2] - middle, autzen[:, 2])(places - middle)
-    told = np.isfinite(found.z)
-    assert told.sum() > 3000
-    np.testing.assert_allclose(found.z[told], expected[told], rtol=0, atol=1e-9)
-
-
-def test_tin_inside_the_hull_and_none_outside() -> None:
-    rng = np.random.default_rng(1)
-    xyz = np.column_stack([rng.uniform(0, 50, (300, 2)), rng.normal(size=300)])
-    places = rng.uniform(-5, 55, (400, 2))
-    found = heights_at(Cloud(xyz), places, "tin", HeightSettings(sigma_xy_m=0.05, refuse=HeightFlag.OK))
-    expected = LinearNDInterpolator(xyz[:, :2], xyz[:, 2])(places)
-    # All points are looked at here, so that slivers along the hull are found as well.
-    np.testing.assert_allclose(found.z, expected, rtol=0, atol=1e-9)
-    outside = np.isnan(expected)
-    assert outside.sum() > 50
-    assert found.flagged(HeightFlag.EDGE)[outside].all()

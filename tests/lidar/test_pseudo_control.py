@@ -13,11 +13,9 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.compiling import run
 from jaxphoto.errors import InputError
 from jaxphoto.lidar.grid import index_cloud
-from jaxphoto.lidar.height_estimate import HeightFlag, HeightSettings
+from jaxphoto.lidar.heights import HeightFlag, HeightSettings
 from jaxphoto.lidar.pseudo_control import pseudo_control_points
-from tests.checked_types import unchecked
 from tests.derivatives import compiled
-from tests.marks import slow_but
 
 POINTS = 32400
 HEIGHT = 1000.0
@@ -113,7 +111,7 @@ def test_is_the_papers_formula(power):
 
 
 @functools.cache
-def errors(ground, density, tilt, interpolation="weighted", noise=NOISE, seed=0):
+def errors(ground, density, tilt, noise=NOISE, seed=0):
     """Height errors of 1,000 features, their sigmas, and which are without a flag."""
     surface, places = GROUNDS[ground]
     rng = np.random.default_rng(seed)
@@ -122,9 +120,7 @@ def errors(ground, density, tilt, interpolation="weighted", noise=NOISE, seed=0)
     truth = np.column_stack([xy, surface(xy)])
     exterior = image(tilt)
     settings = HeightSettings(sigma_xy_m=noise[0], sigma_z_m=noise[1])
-    found = pseudo_control_points(
-        CAMERA, exterior, measured(exterior, truth), grid, settings, interpolation=interpolation
-    )
+    found = pseudo_control_points(CAMERA, exterior, measured(exterior, truth), grid, settings)
     assert (np.isfinite(found.sigma_z) == (np.asarray(found.flag) == 0)).all()
     return found.xyz[:, 2] - truth[:, 2], np.asarray(found.sigma_z), np.asarray(found.flag)
 
@@ -150,14 +146,6 @@ def test_ninety_five_percent_of_the_heights_are_within_the_predicted_sigma(groun
     assert abs(np.mean(np.abs(error[good]) < 1.96 * sigma[good]) - 0.95) <= 0.02
     # No height of the wrong level, such as that of the ground that a roof hides.
     assert np.abs(error[good]).max() < 1.6
-
-
-@pytest.mark.parametrize("ground", ["level", "slope away", "slope towards"])
-def test_a_plane_in_the_image_is_as_true_and_better(ground):
-    error, sigma, flag = errors(ground, 2, 20, "plane")
-    good = flag == 0
-    assert abs(np.mean(np.abs(error[good]) < 1.96 * sigma[good]) - 0.95) <= 0.02
-    assert np.sqrt(np.mean(error[good] ** 2)) < 0.7 * np.sqrt(np.nanmean(errors(ground, 2, 20)[0] ** 2))
 
 
 def test_sigma_of_an_accurate_lidar():
@@ -220,16 +208,11 @@ def test_no_program_is_compiled_for_another_camera_image_or_cloud_of_like_size()
 
 def test_wrong_use_is_told_in_a_sentence():
     grid = indexed(scanned(slope(0, 0), 1, np.random.default_rng(7)))
-    with pytest.raises(InputError, match="choose one of weighted, plane"), unchecked():
-        pseudo_control_points(CAMERA, image(0), np.zeros((1, 2)), grid, interpolation="spline")  # type: ignore[arg-type]
     with pytest.raises(InputError, match="give one or more image coordinates"):
         pseudo_control_points(CAMERA, image(0), np.zeros((0, 2)), grid)
-    with pytest.raises(InputError, match="give points, not radius_m"):
-        pseudo_control_points(CAMERA, image(0), np.zeros((1, 2)), grid, HeightSettings(radius_m=2.0))
 
 
-@pytest.mark.parametrize("interpolation", slow_but(("plane",), ("weighted", "plane")))
-def test_derivatives_are_those_of_differences(interpolation):
+def test_derivatives_are_those_of_differences():
     rng = np.random.default_rng(3)
     grid = indexed(scanned(slope(20, 100), 2, rng))
     exterior = image(20)
@@ -245,13 +228,12 @@ def test_derivatives_are_those_of_differences(interpolation):
     def points(theta):
         interior = InteriorOrientation(theta[0], theta[1], theta[2], Brown(k1=theta[3]))
         taken = ExteriorOrientation.from_angles(theta[4:7], theta[7:10])
-        return pseudo_control_points(interior, taken, xy + theta[10:], grid, settings, interpolation=interpolation).xyz
+        return pseudo_control_points(interior, taken, xy + theta[10:], grid, settings).xyz
 
     differences = np.stack([(points(theta + d) - points(theta - d)) / (2 * d.sum()) for d in np.diag(step)], axis=-1)
     exact = np.asarray(jax.jit(jax.jacfwd(points))(theta))
     wrong = np.abs(exact - differences).max(axis=1) > 1e-4 * np.abs(differences).max(axis=(0, 1))
     assert wrong.any(axis=1).sum() <= 1
     assert np.abs(differences[:, 2]).max(axis=0).min() > 0
-    if interpolation == "weighted":
-        backward = jax.jit(jax.grad(lambda theta: points(theta)[:, 2].mean()))(theta)
-        np.testing.assert_allclose(backward, exact[:, 2].mean(axis=0), rtol=1e-9, atol=1e-12)
+    backward = jax.jit(jax.grad(lambda theta: points(theta)[:, 2].mean()))(theta)
+    np.testing.assert_allclose(backward, exact[:, 2].mean(axis=0), rtol=1e-9, atol=1e-12)

@@ -5,7 +5,7 @@ import pytest
 from scipy.stats import chi2
 
 from jaxphoto.errors import InputError
-from jaxphoto.lidar.planes import fit_plane, planar_patches, ridge_line, roof_centroid
+from jaxphoto.lidar.planes import planar_patches, roof_centroid
 
 SIGMA_XY, SIGMA_Z = 0.5, 0.15
 WIDTH, LENGTH, EAVES = 12.0, 16.0, 6.0
@@ -68,22 +68,6 @@ def test_centroid_and_its_covariance():
         squares.append(error @ np.linalg.solve(covariance, error))
     assert 0.85 < np.mean(squares) / 3 < 1.25
     assert 0.02 < np.mean(np.array(squares) > chi2.ppf(0.95, 3)) < 0.09
-
-
-def test_ridge_is_where_the_faces_meet():
-    rng = np.random.default_rng(4)
-    off = []
-    for _ in range(40):
-        points, face = scanned(rng, 30)
-        planes = [fit_plane(points[face == k], SIGMA_XY, SIGMA_Z) for k in (1, 2)]
-        place, direction = ridge_line(*planes)
-        assert abs(direction[1]) > 0.99
-        off.append(place - ORIGIN - [0, 0, EAVES + np.tan(np.deg2rad(30)) * WIDTH / 2])
-    sem = np.std(off, axis=0) / np.sqrt(40)
-    assert (np.abs(np.mean(off, axis=0)) < 4 * sem)[[0, 2]].all()
-    assert (np.std(off, axis=0) < 0.3)[[0, 2]].all()
-    with pytest.raises(InputError, match="have no intersection line"):
-        ridge_line(planes[0], planes[0])
 
 
 def test_trees_are_no_patches_and_few_points_are_told():

@@ -1,33 +1,25 @@
-"""Planes of strips: correspondence, variances, accumulation by cell, points on planes and breaklines."""
+"""Planes of strips: correspondence, variances, accumulation by cell, points on planes."""
 
 import dataclasses
 
-import hypothesis.strategies as st
 import numpy as np
 import pytest
-from hypothesis import given, settings
 
 from jaxphoto import InputError
 from jaxphoto.cloud import Cloud
-from jaxphoto.lidar.raster import strip_differences
 from jaxphoto.lidar.strip_planes import (
-    CellTally,
-    PointsOnPlanes,
     StripSettings,
     cells_of,
     columns_and_rows,
     corresponding,
-    faces_about,
     fitting,
-    gathered,
-    joined,
     moderated_variances,
     on_planes,
-    planes_from,
     planes_of,
     returns_about,
+    strip_differences,
 )
-from tests.lidar.clouds import SURFACES, gable, ground
+from tests.lidar.clouds import SURFACES, ground
 
 SETTINGS = StripSettings(cell_m=4.0, roughness_m=0.05)
 SHIFT = np.array([0.05, -0.08, 0.12])
@@ -81,35 +73,6 @@ def test_settings_that_cannot_be():
 
 
 THREE_M = StripSettings(cell_m=3.0)
-
-
-def sloping(seed: int, n: int = 4000) -> np.ndarray:
-    """Over both sides of the origin, 900 m up: where squares of heights lose the digits of a centimetre."""
-    rng = np.random.default_rng(seed)
-    xy = rng.uniform(-30, 30, (n, 2))
-    return np.column_stack([xy, 900.0 + 0.3 * xy[:, 0] + rng.normal(0, 0.01, n)])
-
-
-@settings(max_examples=20, deadline=None)
-@given(st.integers(0, 1000), st.lists(st.integers(0, 4000), max_size=5))
-def test_parts_joined_are_the_whole(seed, cuts):
-    xyz = sloping(seed)
-    measured, time, cell = xyz + 0.5, np.arange(len(xyz)) / 100, cells_of(xyz, THREE_M)
-    whole = gathered(xyz, measured, time, cell)
-    parts = [gathered(xyz[p], measured[p], time[p], cell[p]) for p in np.split(np.arange(len(xyz)), sorted(cuts))]
-    for name, one, other in zip(whole._fields, joined(parts), whole, strict=True):
-        np.testing.assert_allclose(one, other, rtol=1e-9, atol=1e-9, err_msg=name)
-
-
-def test_a_tally_gives_the_planes_of_all_returns():
-    xyz, tally = sloping(1, 40_000), CellTally(THREE_M)
-    for part in np.array_split(xyz, 30):
-        tally.add("A", part)
-    found = planes_from(tally.strips["A"], THREE_M)
-    asked = planes_of(xyz, xyz, np.zeros(len(xyz)), cells_of(xyz, THREE_M), THREE_M)
-    assert len(found.cell) == 400
-    np.testing.assert_allclose(found.roughness, asked.roughness, rtol=1e-9)
-    np.testing.assert_allclose(found.normal, asked.normal, atol=1e-10)
 
 
 def test_columns_and_rows_of_cells_on_all_sides_of_the_origin():
@@ -175,60 +138,6 @@ def test_points_above_a_slope():
     np.testing.assert_allclose(np.linalg.norm(points[found.point] - found.foot, axis=1), np.abs(found.gap), atol=1e-12)
 
 
-TEN_RETURNS = StripSettings(cell_m=3.0, returns=10)
-NOISE_M, SIDE = 0.02, 96.0
-
-
-def turned(xyz: np.ndarray) -> np.ndarray:
-    """By 30 degrees, so that no ridge lies along an axis."""
-    c, s = np.cos(np.pi / 6), np.sin(np.pi / 6)
-    return np.column_stack([xyz[:, :2] @ np.array([[c, s], [-s, c]]), xyz[:, 2]])
-
-
-def roofs(sign: float) -> np.ndarray:
-    return turned(ground(lambda x, y: sign * gable(x, y), 8.0, NOISE_M, NOISE_M, SIDE))
-
-
-def on_ridges(sign: float) -> np.ndarray:
-    x, y = np.meshgrid(np.arange(8.0, SIDE, 16.0), np.arange(5.0, SIDE - 5, 7.0))
-    return turned(np.column_stack([x.ravel(), y.ravel(), sign * gable(x.ravel(), y.ravel())]))
-
-
-def over(xyz: np.ndarray, points: np.ndarray) -> PointsOnPlanes:
-    index, face = faces_about(xyz, points, TEN_RETURNS)
-    patches = planes_of(xyz[index], xyz[index], np.zeros(len(index)), face, TEN_RETURNS)
-    return on_planes(patches, np.repeat(points, 2, axis=0))
-
-
-@pytest.mark.parametrize("sign", [1.0, -1.0], ids=["ridge", "valley"])
-def test_a_point_on_a_breakline_lies_on_both_faces(sign):
-    xyz, points = roofs(sign), on_ridges(sign)
-    found = over(xyz, points)
-    assert len(found.point) == 2 * len(points) > 100
-    w = found.gap / found.sigma
-    # What is left of a standard deviation of 1 of some 150 that are known to their own noise, and no bias.
-    assert 0.8 < np.sqrt(np.mean(w**2)) < 1.25 and abs(w.mean()) < 0.3
-    # Across the ridge a point goes into one face and out of the other; along it nothing happens.
-    across, along = turned(np.array([[0.2, 0.0, 0.0], [0.0, 0.2, 0.0]]))
-    gap = {name: over(xyz, points + step).gap for name, step in (("across", across), ("along", along))}
-    pairs = np.sort(gap["across"].reshape(-1, 2), axis=1)
-    np.testing.assert_allclose(pairs.mean(axis=0), [-0.1, 0.1], atol=0.01)
-    assert abs(gap["along"].mean()) < 0.01 and np.abs(gap["along"]).max() < 0.06
-
-
-def test_where_no_two_faces_meet_there_is_none():
-    xyz = roofs(1.0)
-    on_face = on_ridges(1.0) + turned(np.array([[4.0, 0.0, -4 * np.tan(np.pi / 6)]]))
-    outside = np.array([[-500.0, 0.0, 0.0]])
-    index, face = faces_about(xyz, np.concatenate([on_face, outside]), TEN_RETURNS)
-    assert not len(index) and not len(face)
-    # What sticks out of a roof is of no face.
-    chimney = turned(np.random.default_rng(1).uniform([8.5, 46.0, 6.0], [9.2, 46.7, 7.0], (5, 3)))
-    point = turned(np.array([[8.0, 47.0, gable(np.array(8.0), np.array(0.0))]]))
-    index, _ = faces_about(np.concatenate([xyz, chimney]), point, TEN_RETURNS)
-    assert len(index) > 100 and index.max() < len(xyz)
-
-
 RNG = np.random.default_rng(4)
 TWO_M = StripSettings(cell_m=2.0, roughness_m=0.05)
 
@@ -239,34 +148,25 @@ def strip(west, east, height, rough=0.01, n=20_000):
     return np.column_stack([x, y, 0.2 * x + height + RNG.normal(0, rough, n)])
 
 
-def cells_of_strips(*strips):
-    tally = CellTally(TWO_M)
-    for name, xyz in zip("abc", strips, strict=False):
-        for part in np.array_split(xyz, 3):
-            tally.add(name, part)
-    return tally.strips.values()
+def cloud_of(*strips):
+    strip = np.repeat(np.arange(len(strips)), [len(xyz) for xyz in strips])
+    return Cloud(np.concatenate(strips), strip=strip, strips=tuple("abc"[: len(strips)]))
 
 
 def test_gaps_are_where_strips_overlap_with_their_sign():
-    found = strip_differences(cells_of_strips(strip(0.0, 30.0, 0.0), strip(20.0, 50.0, 0.12)), TWO_M)
+    found = strip_differences(cloud_of(strip(0.0, 30.0, 0.0), strip(20.0, 50.0, 0.12)), TWO_M)
     assert found.west == 0.0 and found.cell_m == 2.0
-    x, y, gap = found.centres().T
+    row, column = np.indices(found.heights.shape).reshape(2, -1)
+    x, y, gap = found.west + 2 * column + 1, found.north - 2 * row - 1, found.heights.ravel()
     there = np.isfinite(gap)
     assert there[(x > 20) & (x < 30) & (y > 100) & (y < 120)].all() and not there[(x < 20) | (x > 30)].any()
     np.testing.assert_allclose(gap[there], 0.12, atol=0.02)
 
 
-def test_a_cloud_has_the_gaps_of_its_cells():
-    parts = strip(0.0, 30.0, 0.0), strip(20.0, 50.0, 0.12)
-    cloud = Cloud(np.concatenate(parts), strip=np.repeat([0, 1], 20_000), strips=("a", "b"))
-    found, expected = (strip_differences(of, TWO_M) for of in (cloud, cells_of_strips(*parts)))
-    np.testing.assert_allclose(found.heights, expected.heights, atol=1e-12)
-
-
 def test_of_three_strips_the_largest_gap_counts_and_rough_ground_has_none():
     parts = (strip(0.0, 30.0, 0.0), strip(0.0, 30.0, -0.2), strip(0.0, 30.0, 0.05))
-    found = strip_differences(cells_of_strips(*parts), TWO_M)
+    found = strip_differences(cloud_of(*parts), TWO_M)
     gap = found.heights[np.isfinite(found.heights)]
     np.testing.assert_allclose(gap, 0.25, atol=0.03)
-    assert strip_differences(cells_of_strips(parts[0], strip(0.0, 30.0, 0.1, rough=0.5)), TWO_M) is None
-    assert strip_differences(cells_of_strips(parts[0], strip(60.0, 90.0, 0.1)), TWO_M) is None
+    assert strip_differences(cloud_of(parts[0], strip(0.0, 30.0, 0.1, rough=0.5)), TWO_M) is None
+    assert strip_differences(cloud_of(parts[0], strip(60.0, 90.0, 0.1)), TWO_M) is None

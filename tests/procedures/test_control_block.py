@@ -12,7 +12,7 @@ from jaxphoto.observations import CameraPositions
 from jaxphoto.procedures.control import GivenControl, Marks, at_optimum, control_block
 from jaxphoto.procedures.control.frame import onto_control
 from jaxphoto.procedures.control.marks import without_names
-from jaxphoto.simulation.remeasure import image_coordinates
+from jaxphoto.simulation import image_coordinates
 from tests.blocks import free_network, simulated
 from tests.procedures.controlled import CHECK, CODE, CONTROL, ORIGIN, TURN, marked_block
 

@@ -262,7 +262,7 @@ def test_control_from_a_file(on_the_map, tmp_path, monkeypatch, capsys):
         ("", "K1,1,2,,0.02,0.02,0.02", "control.csv, row 2: point K1 has no height"),
         ("", "K1,1,2,3,,,", "control.csv, row 2: point K1 has no standard deviations"),
         ("", "K1,1,2,3,0.02,0.02,0.02\nK1,1,2,3,0.02,0.02,0.02", "is also in control.csv, row 2"),
-        ("", "K1,1,2,3,0.02,0.02,0.02", "km from the strips"),
+        ("", "K1,1,2,3,0.02,0.02,0.02", "m from the strips"),
     ],
 )
 def test_files_of_control_that_cannot_be(on_the_map, tmp_path, monkeypatch, capsys, head, row, sentence):

@@ -7,7 +7,7 @@ from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
 from jaxphoto import InputError
-from jaxphoto.lidar.raster import Raster
+from jaxphoto.lidar.strip_planes import Raster
 from jaxphoto.report import plot_draws, plot_effects, plot_position_offsets, plot_sensitivity, plot_strip_differences
 from jaxphoto.report.formatting import without_empty
 from jaxphoto.report.sensitivity import SensitivityTables

@@ -24,7 +24,6 @@ from jaxphoto.report.formatting import (
 )
 from jaxphoto.report.tables import check_spread
 from tests.blocks import adjusted
-from tests.commands import run
 
 FEW = ["interior", "exterior", "check_points"]
 
@@ -121,21 +120,6 @@ def test_markdown_is_a_table_of_as_many_cells():
     assert len(x.partition(".")[2]) == len(sigma.partition(".")[2])
 
 
-def test_the_command_writes_those_that_are_asked_for(tmp_path, monkeypatch, capsys):
-    write_tables(Tables(adjusted("cross")), tmp_path / "results", "csv", FEW)
-    out = tmp_path / "tex"
-    command = ("tables", tmp_path / "results", "--to", "latex", "--out", out, "--only", "interior, exterior")
-    code, screen, _ = run(monkeypatch, capsys, *command)
-    assert code == 0 and "2 tables" in screen
-    assert {p.name for p in out.glob("*.tex")} == {"interior.tex", "exterior.tex"}
-    for words, message in (
-        (("--to", "excel"), "'excel' is not one of"),
-        (("--to", "latex", "--only", "inner"), "has no table inner; it has check_points, exterior, interior"),
-    ):
-        code, _, error = run(monkeypatch, capsys, "tables", tmp_path / "results", *words, "--out", tmp_path / "no")
-        assert code != 0 and message in " ".join(error.split()) and not (tmp_path / "no").exists()
-    code, _, error = run(monkeypatch, capsys, "tables", tmp_path, "--to", "csv", "--out", tmp_path / "no")
-    assert code != 0 and "has no tables" in " ".join(error.split())
 
 
 def test_a_table_that_there_is_not_is_named():

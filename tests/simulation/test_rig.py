@@ -16,7 +16,7 @@ from jaxphoto.io import read_block, read_truth, recipe_from, write_block, write_
 from jaxphoto.parameters import numbers_of
 from jaxphoto.procedures.rig import with_rig
 from jaxphoto.simulation import remeasure, simulate
-from jaxphoto.simulation.remeasure import remeasure_rows
+from jaxphoto.simulation.simulate import remeasure_rows
 from jaxphoto.variants import indirect, some_images
 from tests.derivatives import compiled
 from tests.simulation.small import SMALL, changed

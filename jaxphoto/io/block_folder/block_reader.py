@@ -41,7 +41,7 @@ from jaxphoto.io.block_folder.parameters import (
 )
 from jaxphoto.io.block_folder.settings import BlockKeys, Settings, corrections_in, frame_of, read_settings
 from jaxphoto.io.block_folder.table_layout import LAYOUTS, TOML, checked, layout_in
-from jaxphoto.io.text_tables import Table, points_matching, read_csv
+from jaxphoto.io.text_tables import Table, read_csv
 from jaxphoto.io.toml import Section, read_toml
 from jaxphoto.io.trajectory import Records, read_records
 from jaxphoto.observations import AbstractObservations, Distances, sigma_key
@@ -209,7 +209,6 @@ def assemble(source: BlockTables) -> Block:
         surfaces=surfaces,
         partitions=partitions_of(images, settings),
         converted_from=keys.converted_from,
-        breaklines=points_matching(points.ids, keys.breaklines, f"{source.file}, breaklines:"),
     )
     more, more_priors = read_unknowns(top.section("unknowns"), source.unknowns, block)
     start, priors = dataclasses.replace(start, more=more), dataclasses.replace(priors, more=more_priors)

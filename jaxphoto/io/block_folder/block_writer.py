@@ -98,12 +98,10 @@ def _settings(block: Block) -> dict[str, Any]:
                 f"image {image} of camera {camera} has {f'mount {mount}' if mount else 'no mount'}, but block.toml "
                 f"allows one mount per camera; name it {camera} or default, and split a camera with two mounts into two"
             )
-    names = set(block.points)
     optional = {
         "converted_from": block.converted_from,
         "observations": [kind.group for kind in kinds_of(block) if kind not in OBSERVATIONS],
         "partitions": list(block.partitions),
-        "breaklines": [name for name in block.breaklines if name in names],
     }
     return {
         "title": block.title,

@@ -113,7 +113,6 @@ class BlockKeys(Keys):
     observations: _Texts = []  # noqa: RUF012
     unknowns: dict[str, Any] = {}  # noqa: RUF012
     partitions: _Texts = []  # noqa: RUF012
-    breaklines: _Texts = []  # noqa: RUF012
     reference_temperature_c: Number | None = None
     converted_from: StrictStr = ""
 

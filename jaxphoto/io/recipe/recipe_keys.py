@@ -14,7 +14,7 @@ import numpy as np
 from pydantic import AfterValidator, BeforeValidator, Field, StrictBool, StrictStr, create_model, model_validator
 
 from jaxphoto.camera import RATES, CameraSpline, StripCamera
-from jaxphoto.georeferencing import PATTERN_OF, RigCamera
+from jaxphoto.georeferencing import Pattern, RigCamera
 from jaxphoto.io.toml import Count, KeyMistake, Keys, NotNegative, Number, OneOrMore, Positive, Section, Vector, Whole
 from jaxphoto.parameters import AbstractParameters
 from jaxphoto.simulation import (
@@ -291,33 +291,15 @@ class ConvergentKeys(Keys):
         return self
 
 
-class LidarStripKeys(Keys):
-    """Keys of [[lidar.strips]]."""
-
-    name: Name
-    heading_deg: Number
-    length_m: Positive
-    height_m: Positive
-    along_m: Number = 0.0
-    across_m: Number = 0.0
-
-
 class LidarKeys(PlanKeys):
     """Keys of [lidar]."""
 
     kind_of_plan = ScanPlan
     density_per_m2: Positive
     scan_angle_deg: Annotated[Positive, Field(le=_WIDEST_DEG)] = 0.0
-    pattern: Literal[tuple(PATTERN_OF)] = "line"
-    strips: list[LidarStripKeys] = []  # noqa: RUF012
+    pattern: Pattern = "line"
     same_trajectory: StrictBool = False
     truth: LidarTruthKeys = LidarTruthKeys()
-
-    @model_validator(mode="after")
-    def _check(self) -> "LidarKeys":
-        if self.same_trajectory and self.strips:
-            raise KeyMistake("same_trajectory", "[[lidar.strips]] define another flight; remove them, or this key")
-        return self
 
 
 class WalkKeys(Keys):

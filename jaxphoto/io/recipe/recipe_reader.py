@@ -4,7 +4,6 @@ Cameras, mounts, strips and datum have the keys of block.toml. Their subtable `t
 (docs/simulation.md).
 """
 
-import math
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -40,7 +39,6 @@ from jaxphoto.simulation import (
     ConvergentPlan,
     Field,
     FlightPlan,
-    Footprint,
     Recipe,
     ScanPlan,
     Settlement,
@@ -57,8 +55,6 @@ from jaxphoto.unknowns import FREE
 _ZERO = (0.0, 0.0, 0.0)
 # Default error of approximate positions at close range, divided by the shortest object distance.
 _NEAR = 0.02
-# Approximate interval (s) of nodes along a scanner strip.
-_NODES_S = 5.0
 
 
 class BiasTruthKeys(Keys):
@@ -392,16 +388,8 @@ def _lidar(
         raise sigmas.error(
             "lidar_m", "the key is missing, but the recipe has lidar; add its sigmas, like [0.5, 0.5, 0.15]"
         )
-    strips = tuple(_lidar_strip(strip, plan.speed_m_per_s) for strip in keys.lidar.strips)
-    truth, names = keys.lidar.truth.plan(density_per_m2=1.0), [strip.name for strip in strips or plan.strips]
+    truth, names = keys.lidar.truth.plan(density_per_m2=1.0), [strip.name for strip in plan.strips]
     for key in ("shift_m", "drift_m_per_s", "attitude_deg", "attitude_drift_deg_per_s"):
         top.section("lidar").section("truth").section(key).known("default", *names)
     given = {name: getattr(truth, name) for name in keys.lidar.truth.model_fields_set}
-    return keys.lidar.plan(**given, strips=strips)
-
-
-def _lidar_strip(keys: Any, speed: float) -> Strip:
-    """Read a strip of a separate scanner flight."""
-    nodes = 1 + max(1, math.ceil(keys.length_m / (_NODES_S * speed)))
-    base, ground = keys.length_m / (nodes - 1), Footprint(0.0, 0.0)
-    return Strip(keys.name, "", keys.heading_deg, nodes, base, keys.height_m, ground, keys.along_m, keys.across_m)
+    return keys.lidar.plan(**given)

@@ -8,9 +8,8 @@ from it.
 """
 
 import dataclasses
-import warnings
 from collections.abc import Callable, Collection
-from typing import Any, NamedTuple, get_args
+from typing import Any
 
 import equinox as eqx
 import jax
@@ -28,6 +27,7 @@ from jaxphoto.lidar import Grid, HeightSettings, index_cloud, nearest
 from jaxphoto.lidar.correction import (
     ScannerPath,
     ScannerPoses,
+    check_covered,
     correct_cloud,
     correct_trajectory,
     corrected_xyz,
@@ -35,8 +35,7 @@ from jaxphoto.lidar.correction import (
     scanner_path,
     scanner_poses,
 )
-from jaxphoto.lidar.coverage import check_covered
-from jaxphoto.lidar.heights import Method, TangentPlanes, tangent_planes
+from jaxphoto.lidar.heights import Method, heights_at
 from jaxphoto.observations import SurfaceRows
 from jaxphoto.procedures.lidar.iterate_to_convergence import (
     MAX_ROUNDS,
@@ -48,14 +47,12 @@ from jaxphoto.procedures.lidar.iterate_to_convergence import (
     iterate_to_convergence,
     with_common_error,
 )
-from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
+from jaxphoto.procedures.lidar.strip_model import check_measured_from
 from jaxphoto.procedures.lidar.vertical_control import no_surface_error, tie_points
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import Covariance
 from jaxphoto.unknowns import FIXED, FREE, Weighted
 
-SURFACES = get_args(Method)
-"""Names of the surface interpolation methods."""
 SHIFT_SIGMA = 0.3
 """Default standard deviation (m) of a lidar strip's shift."""
 # Number of laser points of a strip near a tie point that can affect its surface; minimum ratio to the number used for
@@ -89,14 +86,6 @@ class Simultaneous(eqx.Module):
     """True if the iteration converged."""
 
 
-class _Strip(NamedTuple):
-    """Measured laser points of one strip, and the scanner path."""
-
-    cloud: Cloud
-    grid: Grid
-    path: ScannerPath | None
-
-
 def simultaneous(
     block: Block,
     cloud: Cloud,
@@ -114,9 +103,6 @@ def simultaneous(
     `priors` are the priors of the scanner. By default its boresight is FREE if `trajectory` (of the scanner, on the
     cloud's clock) gives the scanner position of each point, and FIXED without one; shifts are weighted at zero with
     `SHIFT_SIGMA`. `points` are the names of points on the surface; None selects all tie points.
-
-    Raises BlockError if cloud and block, or cloud and trajectory, do not match; InputError for a boresight without
-    trajectory or times; and the errors of `jaxphoto.adjust`.
     """
     settings = HeightSettings() if settings is None else settings
     names = cloud.strips or ("cloud",)
@@ -142,32 +128,35 @@ def simultaneous(
     which = tie_points(block, points)
     first = adjust_with_fixed_interior(block)
     path = scanner_path(trajectory) if timed else None  # type: ignore[arg-type]
-    for sentence in [] if path is None else check_measured_from(cloud, path):
-        warnings.warn(sentence, UserWarning, stacklevel=2)
-    strips = _strips(cloud, names, path)
+    if path is not None:
+        check_measured_from(cloud, path)
+    strips = []
+    for k, name in enumerate(names):
+        returns = cloud if cloud.strip is None else cloud.take(np.flatnonzero(cloud.strip == k))
+        if not len(returns):
+            raise InputError(f"strip {name} of the cloud has no points: omit it, or read other classes and returns")
+        strips.append((returns, index_cloud(returns.xyz)))
     none: Scanner = jax.tree.map(np.asarray, Scanner(jnp.zeros(3), dict.fromkeys(names, jnp.zeros(3))))
     strip = np.repeat(np.arange(len(names)), len(which))
-
-    def planes(adjusted: Adjustment) -> list[tuple[TangentPlanes, ScannerPoses | None]]:
-        scanner = adjusted.unknowns.scanner or none
-        xy = np.asarray(adjusted.unknowns.points)[which, :2]
-        result = []
-        for of, shift in zip(strips, scanner.shifts.values(), strict=True):
-            near, poses = _near(of, xy, scanner.boresight, shift, settings)
-            index_of = tangent_planes(index_cloud(near), xy, method, settings)
-            result.append(
-                (index_of, None if poses is None else jax.tree.map(lambda v, k=index_of.nearest: v[k], poses))
-            )
-        return result
 
     last: dict[str, Any] = {}
 
     def look(adjusted: Adjustment) -> SurfaceAtPoints:
-        last["planes"] = planes(adjusted)
-        foot, normal, sigma, flag = (
-            np.concatenate([getattr(p, name) for p, _ in last["planes"]])
-            for name in ("foot", "normal", "sigma", "flag")
-        )
+        scanner = adjusted.unknowns.scanner or none
+        xy = np.asarray(adjusted.unknowns.points)[which, :2]
+        last["poses"], planes = [], []
+        for of, shift in zip(strips, scanner.shifts.values(), strict=True):
+            near, poses = _near(*of, path, xy, scanner, shift, settings)
+            grid = index_cloud(near)
+            heights = heights_at(grid, xy, method, settings)
+            # Tangent plane; the height error is projected onto its normal.
+            normal = np.column_stack([-heights.gradient, np.ones(len(xy))])
+            normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+            normal[np.isnan(heights.z)] = np.nan
+            planes.append((np.column_stack([xy, heights.z]), normal, heights.sigma * normal[:, 2], heights.flag))
+            one = np.asarray(grid.order)[nearest(grid, xy, 1).index[:, 0]]
+            last["poses"].append(None if poses is None else jax.tree.map(lambda v, k=one: v[k], poses))
+        foot, normal, sigma, flag = map(np.concatenate, zip(*planes, strict=True))
         usable = np.isfinite(foot).all(axis=1)
         sigma = with_common_error(sigma, usable, settings.sigma_systematic_m)
         if not usable.any():
@@ -176,7 +165,7 @@ def simultaneous(
 
     def build(adjusted: Adjustment, cov: Covariance, surface: SurfaceAtPoints, used: np.ndarray) -> Block:
         scanner = adjusted.unknowns.scanner or none
-        last["turn"] = _turns(surface, strip, [poses for _, poses in last["planes"]])
+        last["turn"] = _turns(surface, strip, last["poses"])
         rows = _surface_rows(surface, used, strip, last["turn"], scanner)
         unknowns = dataclasses.replace(adjusted.unknowns, scanner=scanner)
         posed = dataclasses.replace(block, surfaces=rows, priors=dataclasses.replace(block.priors, scanner=priors))
@@ -201,38 +190,28 @@ def simultaneous(
     )  # fmt: skip
 
 
-def _strips(cloud: Cloud, names: tuple[str, ...], path: ScannerPath | None) -> list[_Strip]:
-    """Split the cloud by strip."""
-    strips = []
-    for k, name in enumerate(names):
-        returns = cloud if cloud.strip is None else cloud.take(np.flatnonzero(cloud.strip == k))
-        if not len(returns):
-            raise InputError(f"strip {name} of the cloud has no points: omit it, or read other classes and returns")
-        strips.append(_Strip(returns, index_cloud(returns.xyz), path))
-    return strips
-
-
 def _near(
-    strip: _Strip,
+    strip: Cloud,
+    grid: Grid,
+    path: ScannerPath | None,
     xy: Float[np.ndarray, "n 2"],
-    boresight: Float[ArrayLike, "3"],
+    scanner: Scanner,
     shift: Float[ArrayLike, "3"],
     settings: HeightSettings,
 ) -> tuple[Cloud, ScannerPoses | None]:
     """Return the corrected laser points that can affect the surface at some positions, and their scanner poses."""
 
     def corrected(index: Int[np.ndarray, "m"]) -> tuple[Cloud, ScannerPoses | None]:
-        returns = strip.cloud.take(index)
-        timed = strip.path is not None and returns.time is not None
-        poses = scanner_poses(strip.path, returns.time) if timed else None  # type: ignore[arg-type]
-        return dataclasses.replace(returns, xyz=corrected_xyz(returns.xyz, poses, boresight, shift)), poses
+        returns = strip.take(index)
+        poses = None if path is None or returns.time is None else scanner_poses(path, returns.time)
+        return dataclasses.replace(returns, xyz=corrected_xyz(returns.xyz, poses, scanner.boresight, shift)), poses
 
-    order = np.asarray(strip.grid.order)
+    order = np.asarray(grid.order)
     # Positions in the measured cloud: remove the correction of the nearest laser point.
-    one = order[nearest(strip.grid, xy, 1).index[:, 0]]
-    offset = strip.cloud.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
-    enough = min(max(_NEAR, _TIMES * settings.points), len(strip.cloud))
-    return corrected(np.unique(order[nearest(strip.grid, xy + offset, enough).index]))
+    one = order[nearest(grid, xy, 1).index[:, 0]]
+    offset = strip.xyz[one, :2] - corrected(one)[0].xyz[:, :2]
+    enough = min(max(_NEAR, _TIMES * settings.points), len(strip))
+    return corrected(np.unique(order[nearest(grid, xy + offset, enough).index]))
 
 
 def _turns(

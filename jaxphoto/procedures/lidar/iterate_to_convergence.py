@@ -154,8 +154,6 @@ def iterate_to_convergence(
     is nearly equal, and finally in any case: otherwise the set of neighbouring laser points could alternate. `carry`
     transforms an earlier observation from the previous corrected cloud to the current one. The observations are the
     last rows of their `group`.
-
-    Raises BlockError if cloud and points are too far apart.
     """
     adjusted, cov, fits = first, covariance(first), np.array(True)
     before, at_first = first, look(first)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxphoto.cloud import Cloud
-from jaxphoto.errors import BlockError, few
+from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Pattern, StripErrors
 from jaxphoto.lidar.correction import ScannerPath, corrected_strip, times_of
 from jaxphoto.lidar.strip_planes import (
@@ -19,12 +19,10 @@ from jaxphoto.lidar.strip_planes import (
     StripSettings,
     cells_of,
     corresponding,
-    faces_about,
     fitting,
     on_planes,
     planes_of,
     returns_about,
-    windows_of_returns,
 )
 from jaxphoto.observations import StripPlanes, StripPoints
 from jaxphoto.procedures.lidar.strip_model import Look, looks_of, plane_rows, side_of, thinned
@@ -138,18 +136,11 @@ class PointPlanes(NamedTuple):
 class PointSearch:
     """Repeated search for planes at points. Once `settled`, returns stay with their points, as in `StripSearch`.
 
-    `points` contains block indices: `on_planes` once, and `on_breaklines` twice, for both faces.
+    `points` contains block indices.
     """
 
-    def __init__(
-        self,
-        search: StripSearch,
-        on_planes: Int[np.ndarray, "plain"],
-        on_breaklines: Int[np.ndarray, "lines"] | None = None,
-    ) -> None:
-        lines = np.zeros(0, int) if on_breaklines is None else on_breaklines
-        self.search, self.points = search, np.concatenate([on_planes, np.repeat(lines, 2)])
-        self._plain = len(on_planes)
+    def __init__(self, search: StripSearch, points: Int[np.ndarray, "n"]) -> None:
+        self.search, self.points = search, points
         self.about: list[tuple[np.ndarray, ...]] = []
 
     def look(
@@ -158,12 +149,14 @@ class PointSearch:
         """Return the planes at points (m) with covariances `spread`, in the strips last corrected by `StripSearch`."""
         search, about, seen = self.search, [], []
         for k, (strip_look, xyz) in enumerate(zip(search.looks, search.corrected, strict=True)):
-            about.append(self.about[k] if settled else self._about(xyz, place))
+            about.append(self.about[k] if settled else returns_about(xyz, place, search.settings))
             index, point = about[-1]
             measured, time = search.cloud.xyz[strip_look.returns], times_of(search.cloud)[strip_look.returns]
             patches = planes_of(xyz[index], measured[index], time[index], point, search.settings)
             found = on_planes(patches, place)
-            found = found._replace(sigma=found.sigma * np.sqrt(windows_of_returns(index, point)[found.point]))
+            # Mean number of windows of a return near each point: count returns shared by close points once.
+            windows = np.bincount(point, np.bincount(index)[index]) / np.maximum(np.bincount(point), 1)
+            found = found._replace(sigma=found.sigma * np.sqrt(windows[found.point]))
             of_points = np.einsum("ni,nij,nj->n", patches.normal, spread[found.point], patches.normal)
             sigma = np.sqrt(found.sigma**2 + of_points)
             seen.append(
@@ -171,27 +164,6 @@ class PointSearch:
             )
         self.about = about
         return seen
-
-    def _about(self, xyz: Float[np.ndarray, "n 3"], place: Float[np.ndarray, "points 3"]) -> tuple[np.ndarray, ...]:
-        """Return the returns near each point, or on its face, and the index of the point for each."""
-        index, point = returns_about(xyz, place[: self._plain], self.search.settings)
-        of_faces, face = faces_about(xyz, place[self._plain :: 2], self.search.settings)
-        return np.concatenate([index, of_faces]), np.concatenate([point, self._plain + face])
-
-    def unseen(self, planes: Sequence[PointPlanes], names: Sequence[str]) -> list[str]:
-        """Return a message if points on breaklines have no faces in any strip; `names` are the names of the block's
-        points.
-        """
-        lines = self.points[self._plain :: 2]
-        number = np.concatenate([f.found.point[f.found.point >= self._plain] for f in planes])
-        out = np.setdiff1d(np.arange(len(lines)), (number - self._plain) // 2)
-        if not len(out):
-            return []
-        return [
-            f"{len(out)} of {len(lines)} points on breaklines lack two smooth faces in every strip and have no "
-            f"observations: {few([names[p] for p in lines[out]])}; use cells (--cell-m) half as wide as the roofs, or "
-            "omit these points"
-        ]
 
     def rows(self, planes: Sequence[PointPlanes], errors: StripErrors) -> tuple[StripPoints, ...]:
         """Return the accepted points as observations: one group, or none."""

@@ -77,9 +77,6 @@ def roof_control(
     cloud without classes (or with 0 and 1 only) all points are searched, including level ground. Points named in
     `centroids` were measured at the centre of a roof face, and become control in X, Y and Z. The standard deviation of
     n points on one plane is sqrt(n) times the standard deviation of the plane there, which is common to them.
-
-    Raises BlockError if no tie point lies on a roof, or a centroid is outside all roofs; InputError for names that are
-    not points; and the errors of `jaxphoto.adjust`.
     """
     settings = HeightSettings() if settings is None else settings
     check_without_surfaces(block)

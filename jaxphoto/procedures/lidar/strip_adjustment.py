@@ -18,16 +18,13 @@ from jaxphoto.block import empty_block
 from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import StripErrors, StripSpline, Trajectory
-from jaxphoto.lidar.correction import correct_flight, scanner_path, times_of
-from jaxphoto.lidar.coverage import check_covered
+from jaxphoto.lidar.correction import check_covered, correct_flight, scanner_path, times_of
 from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.observations import StripPoints
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.control.surveyed import SurveyedPoints
 from jaxphoto.procedures.lidar.iterate_to_convergence import CHANGE_LIMIT, adjust_with_fixed_interior, at_result
-from jaxphoto.procedures.lidar.photographs import Photographs, check_photographs, on_trajectory, spans_with
 from jaxphoto.procedures.lidar.plane_search import CommonPlanes, PointPlanes, PointSearch, StripSearch, check_joined
-from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 from jaxphoto.procedures.lidar.strip_control import (
     CHECK,
     CONTROL,
@@ -39,7 +36,18 @@ from jaxphoto.procedures.lidar.strip_control import (
     with_control,
     with_datum,
 )
-from jaxphoto.procedures.lidar.strip_model import ScannerPriors, errors_of, knot_sigmas, step_rows, strip_block
+from jaxphoto.procedures.lidar.strip_model import (
+    Photographs,
+    ScannerPriors,
+    check_measured_from,
+    check_photographs,
+    errors_of,
+    knot_sigmas,
+    on_trajectory,
+    spans_with,
+    step_rows,
+    strip_block,
+)
 from jaxphoto.procedures.lidar.vertical_control import tie_points
 from jaxphoto.statistics import Covariance, covariance
 from jaxphoto.unknowns import FIXED
@@ -109,8 +117,6 @@ class StripAdjustment(eqx.Module):
     rounds: tuple[StripRound, ...]
     converged: bool
     """True if the iteration converged."""
-    warnings: tuple[str, ...] = ()
-    """Messages about inconsistencies of cloud and trajectory."""
     surveyed: tuple[SurveyedGap, ...] = ()
     """Control and check points above the planes of strips: one item per point and plane."""
 
@@ -132,8 +138,8 @@ def adjust_strips(
     Standard deviations in the trajectory replace the values of `settings`; zero means unknown.
 
     `photographs` of the same flight are also adjusted: their exposures have the trajectory's errors, and their tie
-    points lie on the planes of the strips, points on breaklines on both faces. Their block defines the unknowns of
-    cameras and mounts; its stations and attitudes are assumed to come from the trajectory.
+    points lie on the planes of the strips. Their block defines the unknowns of cameras and mounts; its stations and
+    attitudes are assumed to come from the trajectory.
 
     `control` contains surveyed points on smooth surfaces, in the cloud's system (m): planes near them are observed to
     pass through them. Its check points are only compared. Without a trajectory control also defines the datum.
@@ -142,11 +148,6 @@ def adjust_strips(
     FIXED. For circular patterns, forward and backward looks of a strip are also compared. `fixed` are strips whose
     trajectory is not corrected, or "all". Without a trajectory each strip has only a shift, and by default the first is
     fixed in the directions that control does not determine.
-
-    Raises InputError for a cloud of one strip without control, for strips without points or without the times that a
-    trajectory needs, for a time offset of a circular scanner and for control without heights or standard deviations;
-    BlockError for strips without common planes, for control away from them and for a trajectory that does not cover the
-    cloud or the exposures; and the errors of `jaxphoto.adjust`.
     """
     settings = StripSettings() if settings is None else settings
     if trajectory is None and priors is not None:
@@ -164,8 +165,10 @@ def adjust_strips(
     names = _check(cloud, trajectory, fixed, photographs is None and priors.right, control is not None)
     path = None if trajectory is None else scanner_path(trajectory)
     pattern = priors.calibration.pattern
-    messages = [] if path is None else check_measured_from(cloud, path, None if priors.right else pattern)
-    spans, images = _spans(cloud), None
+    if path is not None:
+        check_measured_from(cloud, path, None if priors.right else pattern)
+    time, images = times_of(cloud), None
+    spans = np.array([(t.min(), t.max()) for t in (time[cloud.strip == k] for k in range(len(names)))])
     if photographs is not None:
         check_photographs(photographs, trajectory)
         spans = spans_with(photographs.time, spans)
@@ -185,19 +188,23 @@ def adjust_strips(
         block = strip_block(names, splines, fixed, sigmas, priors, block)
     steps = tuple(rows for rows in step_rows(splines, sigmas, settings) if len(rows))
     search, errors = StripSearch(cloud, path, settings, pattern), errors_of(block.start.unknowns, splines)
-    first = common = search.look(errors, settled=False)
-    check_joined(names, common)
-    ties = None
-    if images is not None and photographs is not None:
-        lines = tie_points(images, photographs.breaklines)
-        ties = PointSearch(search, np.setdiff1d(tie_points(images), lines), lines)
-    first_on_ties = on_ties = (
-        []
-        if ties is None or before_strips is None
-        else ties.look(*_points_and_covariances(ties, before_strips, covariance(before_strips)), False)
-    )
+    ties = None if images is None else PointSearch(search, tie_points(images))
     surveyed = None if control is None else ControlSearch(search, control, number)
-    first_on_surveyed = on_surveyed = OnStrips([], []) if surveyed is None else surveyed.look(settled=False)
+
+    def look(
+        adjusted: Adjustment | None, cov: Covariance | None, settled: bool
+    ) -> tuple[list[CommonPlanes], list[PointPlanes], OnStrips]:
+        """Search for common planes of strips, and planes at tie points and surveyed points."""
+        common, on_ties = search.look(errors, settled), []
+        if ties is not None and adjusted is not None and cov is not None:
+            place, spread = (np.asarray(v)[ties.points] for v in (adjusted.unknowns.points, cov.points))
+            on_ties = ties.look(place, spread, settled)
+        return common, on_ties, OnStrips([], []) if surveyed is None else surveyed.look(settled)
+
+    first, first_on_ties, first_on_surveyed = common, on_ties, on_surveyed = look(
+        before_strips, None if before_strips is None else covariance(before_strips), False
+    )
+    check_joined(names, common)
     if control is not None:
         check_seen(control, on_surveyed, search)
         block = block if trajectory is not None or fixed else with_datum(block, names[0], on_surveyed, settings)
@@ -212,19 +219,18 @@ def adjust_strips(
         # Include rows, because any iteration may be the last: its covariance also serves the tables of the result.
         cov = covariance(adjusted, rows=True)
         now = np.asarray(adjusted.values.shared)[adjusted.structure.free]
+        gaps = np.concatenate([np.zeros(0), *(f.pairs.gap[f.fits] for f in common)])
+        fits = [f.fits for f in common] + [f.fits for f in (*on_ties, *on_surveyed.control)]
+        rejected = sum(int((~of).sum()) for of in fits)
         counted = len(planes), sum(map(len, points)), sum(map(len, control_rows))
-        rounds.append(
-            _iteration_record(
-                len(rounds) + 1, counted, common, [*on_ties, *on_surveyed.control], _change(now - before, cov)
-            )
-        )
+        sigma = np.asarray(cov.shared_sigma)
+        change = float(np.max(np.abs(now - before)[sigma > 0] / sigma[sigma > 0], initial=0.0))
+        rounds.append(StripRound(len(rounds) + 1, *counted, rejected, _rms(gaps), change))
         report(rounds[-1])
         converged = rounds[-1].largest_change < CHANGE_LIMIT and bool(adjusted.converged)
         block, before, errors = at_result(block, adjusted.unknowns), now, errors_of(adjusted.unknowns, splines)
         settled = len(rounds) >= _SETTLED
-        common = search.look(errors, settled)
-        on_ties = [] if ties is None else ties.look(*_points_and_covariances(ties, adjusted, cov), settled)
-        on_surveyed = OnStrips([], []) if surveyed is None else surveyed.look(settled)
+        common, on_ties, on_surveyed = look(adjusted, cov, settled)
         if converged or len(rounds) >= max_rounds:
             return StripAdjustment(
                 before_strips,
@@ -239,7 +245,6 @@ def adjust_strips(
                 + _point_differences(CHECK, first_on_surveyed.check, on_surveyed.check),
                 tuple(rounds),
                 converged,
-                (*messages, *(() if ties is None else ties.unseen(on_ties, adjusted.block.points))),
                 () if control is None else surveyed_gaps(control, on_surveyed, errors, path, adjusted, cov),
             )
         # Free gigabytes for large flights before the next iteration.
@@ -273,13 +278,6 @@ def _check(
     return names
 
 
-def _spans(cloud: Cloud) -> Float[np.ndarray, "strips 2"]:
-    """Return first and last time of each strip (s)."""
-    time = times_of(cloud)
-    times = [time[cloud.strip == k] for k in range(len(cloud.strips))]
-    return np.array([(t.min(), t.max()) for t in times])
-
-
 def _splines(
     spans: Float[np.ndarray, "strips 2"], trajectory: Trajectory | None, settings: StripSettings
 ) -> tuple[StripSpline, ...]:
@@ -297,31 +295,6 @@ def _splines(
             StripSpline.constant(first) if constant else StripSpline.over(first, start, end, settings.knots_s)
         )
     return tuple(splines)
-
-
-def _iteration_record(
-    number: int,
-    observed: tuple[int, int, int],
-    planes: Sequence[CommonPlanes],
-    on: Sequence[PointPlanes],
-    change: float,
-) -> StripRound:
-    gaps = np.concatenate([np.zeros(0), *(f.pairs.gap[f.fits] for f in planes)])
-    left_out = sum(int((~f).sum()) for f in (*(f.fits for f in planes), *(f.fits for f in on)))
-    return StripRound(number, *observed, left_out, _rms(gaps), change)
-
-
-def _points_and_covariances(
-    search: PointSearch, adjusted: Adjustment, cov: Covariance
-) -> tuple[np.ndarray, np.ndarray]:
-    """Return adjusted positions of points (m), and their covariances."""
-    return np.asarray(adjusted.unknowns.points)[search.points], np.asarray(cov.points)[search.points]
-
-
-def _change(moved: Float[np.ndarray, "unknowns"], cov: Covariance) -> float:
-    """Return the largest change of an unknown, in standard deviations."""
-    sigma = np.asarray(cov.shared_sigma)
-    return float(np.max(np.abs(moved)[sigma > 0] / sigma[sigma > 0], initial=0.0))
 
 
 def _differences(before: Sequence[CommonPlanes], after: Sequence[CommonPlanes]) -> tuple[StripDifference, ...]:

@@ -34,8 +34,6 @@ CONTROL, CHECK = "control", "check points"
 """Names of surveyed points in tables of differences."""
 # Maximum distance (m) of a strip from control in the same system; larger ones indicate another height system, or feet.
 _FAR_M = 10.0
-# Minimum distance (m) that messages state in kilometres.
-_KILOMETRES = 10_000.0
 # Prior sigmas (m) of a strip: in fixed directions, small compared with control; in free directions, large.
 _RIGHT_M, _FREE_M = 1e-3, 100.0
 # Number of reweighting iterations for the common shift of control; number of standard deviations below which gaps have
@@ -122,7 +120,7 @@ def check_seen(control: SurveyedPoints, surveyed: OnStrips, search: StripSearch)
         away = float(np.median(np.linalg.norm(offset, axis=1)))
         if away > 0:
             raise BlockError(
-                f"the points of {control.file} lie {_far(away)} from the strips: give them in the cloud's coordinate "
+                f"the points of {control.file} lie {away:.0f} m from the strips: give them in the cloud's coordinate "
                 "system and in metres, easting first"
             )
         raise BlockError(
@@ -160,10 +158,6 @@ def with_datum(block: Block, strip: str, surveyed: OnStrips, settings: StripSett
     return dataclasses.replace(
         block, priors=dataclasses.replace(block.priors, more=more | {TrajectoryKnot.kind: knots})
     )
-
-
-def _far(metres: float) -> str:
-    return f"{metres:.0f} m" if metres < _KILOMETRES else f"{metres / 1000:.0f} km"
 
 
 def _remove_common_shift(

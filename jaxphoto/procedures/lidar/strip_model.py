@@ -16,6 +16,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.block import Block, empty_block
 from jaxphoto.cloud import Cloud
+from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import (
     Pattern,
     Scanner,
@@ -26,11 +27,29 @@ from jaxphoto.georeferencing import (
     TrajectoryKnot,
     knot_name,
 )
-from jaxphoto.lidar.correction import PORTION, ScannerPath, corrected_strip, in_portions, scanner_motions, scanner_poses
+from jaxphoto.georeferencing.time_scales import looks_like, shift_that_fits
+from jaxphoto.lidar.correction import (
+    PORTION,
+    ScannerPath,
+    corrected_strip,
+    covers,
+    in_portions,
+    scanner_motions,
+    scanner_path,
+    scanner_poses,
+)
 from jaxphoto.lidar.strip_planes import PlanePairs, StripPatches, StripSettings, steep
-from jaxphoto.observations import AttitudeSteps, PositionSteps, StripPlanes
+from jaxphoto.observations import (
+    Attitudes,
+    AttitudeSteps,
+    CameraPositions,
+    PositionSteps,
+    StripPlanes,
+    TrajectoryAttitudes,
+    TrajectoryStations,
+)
 from jaxphoto.parameters import AbstractParameters, dynamic_fields
-from jaxphoto.procedures.lidar.iterate_to_convergence import at_result
+from jaxphoto.procedures.lidar.iterate_to_convergence import at_result, check_without_surfaces
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
@@ -67,6 +86,58 @@ def aside(cloud: Cloud, which: Int[np.ndarray, "n"], path: ScannerPath) -> Float
         shot = np.einsum("nji,nj->ni", poses.object_from_body, cloud.xyz[portion] - poses.position)
         parts.append(shot[:, :2] / np.maximum(-shot[:, 2:], 1e-9))
     return np.concatenate(parts)
+
+
+def check_measured_from(cloud: Cloud, path: ScannerPath, pattern: Pattern | None = None) -> None:
+    """Raise BlockError if the points of `cloud` cannot have been measured from this trajectory, or by this pattern.
+
+    In the body frame, a scanner's points are in the same region along the whole flight. If the trajectory is in another
+    system, in feet, on another clock or has another yaw, they are not, and an adjustment is meaningless.
+    """
+    some = np.linspace(0, len(cloud) - 1, min(_PROBED, len(cloud))).astype(int)
+    time = cloud.time[some]  # type: ignore[index]
+    away = float(np.median(np.linalg.norm(cloud.xyz[some] - scanner_poses(path, time).position, axis=1)))
+    cure = "bring cloud and trajectory into one coordinate system, in metres, and onto one clock, angles in degrees"
+    if away > _FARTHEST_M:
+        raise BlockError(f"the laser points are {away / 1000:.0f} km from the scanner's trajectory: {cure}")
+    second = np.floor(time - time.min()).astype(np.int64)
+    order = np.argsort(second, kind="stable")
+    _, first, number = np.unique(second[order], return_index=True, return_counts=True)
+    tangents = aside(cloud, some, path)
+    parts = [tangents[order[k : k + n]] for k, n in zip(first, number, strict=True) if n >= _FEWEST_A_SECOND]
+    if not parts:
+        return
+    # Use the first and last decile: a return above the scanner may be arbitrarily far across.
+    low, middle, high = np.stack([np.quantile(part, (0.1, 0.5, 0.9), axis=0) for part in parts], axis=1)
+    right, ahead = np.median((high - low) / 2, axis=0)
+    half = max(right, ahead)
+    if half < _NARROW:
+        return
+    moves = np.subtract(*np.quantile(middle, (0.9, 0.1), axis=0)) / 2
+    if max(moves) > _WANDERS * half or np.abs(np.median(middle, axis=0)).max() > _ASIDE:
+        raise BlockError(
+            f"laser points of one second scatter about the scanner, up to {np.abs(middle).max():.1f} flying heights to "
+            f"one side, but the swath is {2 * half:.2f} flying heights wide: {cure}"
+        )
+    spread = f"laser points of one second spread to the side by {right:.2f} of the height and ahead by {ahead:.2f}"
+    if pattern is not None and right < _ALIKE * ahead:
+        raise BlockError(
+            f"{spread}: the scan is not across the x axis. Correct the trajectory's yaw, or rotate it to the scanner "
+            "axes"
+        )
+    scanned: Pattern = "circle" if ahead > _ALIKE * right else "line"
+    if pattern is not None and scanned != pattern:
+        raise BlockError(f"{spread}, as for a {scanned} scan: give its pattern (--pattern {scanned})")
+
+
+# Maximum range of an airborne laser scanner (m); number of points examined; minimum number of points per second.
+_FARTHEST_M, _PROBED, _FEWEST_A_SECOND = 10_000.0, 50_000, 20
+# Maximum drift of the one-second median, in half swath widths (allows gaps over water); maximum of its median over the
+# flight, as a tangent.
+_WANDERS, _ASIDE = 1.5, 3.0
+# Ratio of the spreads ahead and across above which the pattern is circular, below which it consists of lines; minimum
+# half swath width, relative to the height, for this test.
+_ALIKE, _NARROW = 0.5, 0.02
 
 
 _ZERO = np.zeros(3)
@@ -241,3 +312,98 @@ def step_rows(
 
 
 _angles = eqx.filter_jit(jax.vmap(roll_pitch_yaw_from_matrix))
+
+
+# Photographs of the same flight as laser strips: their exposures lie on the trajectory of the scanner.
+
+# Maximum distance (m) of stations from the trajectory; larger ones belong to another trajectory or time.
+_FAR_M = 10.0
+
+
+class Photographs(NamedTuple):
+    """Block of images, and the exposure times on the clock of the cloud and its trajectory."""
+
+    block: Block
+    """Block whose stations and attitudes come from the trajectory."""
+    time: Float[np.ndarray, "images"]
+    """Exposure times in seconds."""
+
+
+def check_photographs(photographs: Photographs, trajectory: Trajectory | None) -> None:
+    """Raise InputError or BlockError for photographs that do not match the trajectory."""
+    block, time = photographs.block, photographs.time
+    if trajectory is None:
+        raise InputError(
+            "photographs and strips need their common trajectory: give it (--trajectory), or adjust the strips alone"
+        )
+    if any(isinstance(rows, StripPlanes) for rows in block.more):
+        raise BlockError(
+            "the block is the result of a joint adjustment (planes in strip_planes.csv): adjust it by jaxphoto "
+            "adjust, or give the original block"
+        )
+    check_without_surfaces(block)
+    unknown = np.flatnonzero(~np.isfinite(time))
+    if len(unknown):
+        raise InputError(
+            f"image {block.images[unknown[0]]} has no time_s, so its position on the trajectory is unknown: give the "
+            "times of all exposures in images.csv"
+        )
+    if not len(block.stations):
+        raise InputError("the block has no stations: add [trajectory] to block.toml, or stations.csv")
+    times = np.asarray(trajectory.time)
+    for k in np.flatnonzero(~covers(trajectory, time))[:1]:
+        shift = shift_that_fits(time, times[0], times[-1])
+        clock = "on its clock" if shift is None else f"{shift:+.15g} s later, all within the trajectory"
+        raise BlockError(
+            f"image {block.images[k]} was exposed at {time[k]:.3f} s, where the trajectory has no records: the "
+            f"exposures are at {looks_like(time)}, the trajectory at {looks_like(times)}; give the trajectory of the "
+            f"whole flight, or the exposures {clock} (--exposure-shift-s)"
+        )
+    rows = block.stations
+    at = scanner_poses(scanner_path(trajectory), time[rows.who]).position
+    offset = np.asarray(rows.value) - at[np.arange(len(rows)), rows.axis]
+    apart = float(np.median(np.sqrt(np.bincount(rows.who, offset**2)[np.unique(rows.who)])))
+    if apart > _FAR_M:
+        raise BlockError(
+            f"the stations of the block are {apart:.0f} m from the trajectory at their times: bring both onto one "
+            "clock (--exposure-shift-s) and into one coordinate system"
+        )
+
+
+def spans_with(
+    time: Float[np.ndarray, "images"], spans: Float[np.ndarray, "strips 2"]
+) -> Float[np.ndarray, "strips 2"]:
+    """Return first and last times of strips (s), extended to the exposures on their trajectories."""
+    strip = _strip_of(time, spans)
+    times_of_strip = [np.append(time[strip == k], span) for k, span in enumerate(spans)]
+    return np.array([(t.min(), t.max()) for t in times_of_strip])
+
+
+def on_trajectory(
+    photographs: Photographs,
+    splines: Sequence[StripSpline],
+    spans: Float[np.ndarray, "strips 2"],
+    settings: StripSettings,
+) -> Block:
+    """Return the block with stations and attitudes of a trajectory with errors `splines` over `spans`.
+
+    They replace the block's observations, which come from the same instruments and would be used twice.
+    """
+    block, time = photographs.block, photographs.time
+    strip, knots, weights = _strip_of(time, spans), np.zeros((len(time), 4), int), np.zeros((len(time), 4))
+    for k, spline in enumerate(splines):
+        in_strip = strip == k
+        knots[in_strip], weights[in_strip] = spline.weights(time[in_strip])
+    s, a = block.stations, block.attitudes
+    sigma, turn = np.full(len(s), settings.sigma_exposure_m), np.deg2rad(settings.sigma_exposure_deg)
+    position = TrajectoryStations(s.who, knots[s.who], weights[s.who], s.axis, np.asarray(s.value), sigma)
+    angles = np.asarray(a.roll_pitch_yaw)
+    attitude = TrajectoryAttitudes(a.image, knots[a.image], weights[a.image], angles, np.full(angles.shape, turn))
+    more = (*block.more, position, *([attitude] if len(attitude) else []))
+    return dataclasses.replace(block, stations=CameraPositions.none(), attitudes=Attitudes.none(), more=more)
+
+
+def _strip_of(time: Float[np.ndarray, "images"], spans: Float[np.ndarray, "strips 2"]) -> Int[np.ndarray, "images"]:
+    """Return the laser strip of each exposure: the nearest in time."""
+    away = np.maximum(spans[:, :1] - time, time - spans[:, 1:])
+    return np.argmin(np.maximum(away, 0.0), axis=0)

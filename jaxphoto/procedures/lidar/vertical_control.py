@@ -32,7 +32,7 @@ from jaxphoto.procedures.lidar.iterate_to_convergence import (
 )
 from jaxphoto.statistics import Covariance
 
-Method = Literal["idw", "plane", "tin", "local", "image"]
+Method = Literal["plane", "local", "image"]
 METHODS = get_args(Method)
 """Names of the interpolation methods."""
 
@@ -72,9 +72,6 @@ def lidar_control(
 
     A tie point has no control, fixed or check coordinates. The block needs a datum without the cloud: camera stations
     or control. `report` is called after each iteration.
-
-    Raises BlockError if cloud and points do not overlap, or no height is determined; InputError for names that are not
-    points; and the errors of `jaxphoto.adjust`.
     """
     settings = HeightSettings() if settings is None else settings
     grid = cloud if isinstance(cloud, Grid) else index_cloud(cloud)
@@ -110,10 +107,7 @@ def lidar_control(
 
 
 def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.ndarray, "points"]:
-    """Return the named points, or all without control, fixed or check coordinates.
-
-    Raises InputError for a name that is not a point or whose height is already control, BlockError without tie points.
-    """
+    """Return the named points, or all without control, fixed or check coordinates."""
     observed = [rows.who for rows in (block.control, block.fixed, block.check)]
     if names is None:
         free = np.setdiff1d(np.arange(len(block.points)), np.concatenate(observed).astype(int))
