@@ -21,12 +21,10 @@ from jaxphoto.stability.bundles import (
 from jaxphoto.stability.comparison import (
     Analysis,
     Change,
-    Combination,
     OffsetUncertainty,
     ParameterChange,
     analyse,
     change,
-    combine,
     mahalanobis,
     offset_uncertainty,
 )
@@ -42,7 +40,6 @@ __all__ = [
     "Analysis",
     "BundleOffsets",
     "Change",
-    "Combination",
     "Differences",
     "DistortionCurve",
     "ErrorBand",
@@ -55,7 +52,6 @@ __all__ = [
     "bundle_offsets",
     "change",
     "check_rays",
-    "combine",
     "concentration",
     "distortion_curve",
     "error_band",
