@@ -14,8 +14,7 @@ from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import camera_words, few
 from jaxphoto.observations import PRIORS, AbstractObservations, Correlated
 from jaxphoto.procedures.adjust import ABSURD
-from jaxphoto.procedures.blunder_causes import InflatedComponent, coordinate_mistakes, is_mirrored
-from jaxphoto.procedures.snooping import SEVERAL, Snooped, mostly_rejected, rejected_images
+from jaxphoto.procedures.snooping import SEVERAL, InflatedComponent, Snooped, mostly_rejected, rejected_images
 from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words, symbol
 from jaxphoto.report.formatting import in_file_unit
 from jaxphoto.report.tables import Tables
@@ -363,19 +362,12 @@ def _common_of(name: str, rows: AbstractObservations, left: list[Suspect], block
 def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
     """Find images and groups with too many rejections for isolated errors."""
     most = rejected_images(snooped, block)
-    mirrored = [k for k in most if is_mirrored(snooped, block, k)]
-    for which, hint in (
-        (mirrored, "They fit mirrored: x and y are exchanged, or one of them has the wrong sign"),
-        ([k for k in most if k not in mirrored], "Check its point names, axes, camera and station, or remove it"),
-    ):
-        if images := [f"{block.images[k]} ({most[k][0]} of {most[k][1]})" for k in which]:
-            yield Finding("rejected_images", "error", few(images), len(images), hint=hint)
-    mistakes = coordinate_mistakes(snooped, block)
+    if images := [f"{block.images[k]} ({n} of {total})" for k, (n, total) in most.items()]:
+        hint = "Check its point names, signs, axes, camera and station, or remove it"
+        yield Finding("rejected_images", "error", few(images), len(images), hint=hint)
     for name, counts in mostly_rejected(snooped, block).items():
         many = ", ".join(f"{n} of {of} in {axis}" for axis, (n, of) in counts.items())
         hint = "Check their units, axes, names and signs, and the fixed values"
-        if name in mistakes:
-            hint = f"They fit if {mistakes[name]}: correct them at their source"
         yield Finding("rejected_group", "error", f"{name.replace('_', ' ')}, {many}", hint=hint)
 
 
