@@ -513,7 +513,7 @@ def _block_and_cloud(block: Path, cloud: Path, selection: dict[str, Any], progre
     """Read a block, and the part of the cloud near its points."""
     import numpy as np
 
-    from jaxphoto.initial import approximate
+    from jaxphoto.initial.approximate import approximate
     from jaxphoto.io import clouds, read_block
 
     read = read_block(block)

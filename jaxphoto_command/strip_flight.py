@@ -15,7 +15,7 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import InputError, counted
 from jaxphoto.extras.formats import read_control
 from jaxphoto.georeferencing import PATTERN_OF, ScannerCalibration, Trajectory
-from jaxphoto.initial import approximate
+from jaxphoto.initial.approximate import approximate
 from jaxphoto.io import clouds, read_block, write_block
 from jaxphoto.io.block_folder import exposure_times
 from jaxphoto.io.clouds.coordinate_system import CoordinateSystem, Placement
