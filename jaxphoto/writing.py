@@ -1,8 +1,8 @@
 """Atomic writing of files and directories: complete or not at all, without loss of a user's files.
 
 A directory written by jaxphoto contains the file `MARKER`, a list of the files written by jaxphoto with their SHA-256.
-Only such a directory is replaced, only if these files are unchanged, and all other files in it are retained. Temporary
-files are in a hidden directory next to their target.
+Only such a directory is written to again, only if these files are unchanged; all other files in it are retained.
+Temporary files are in a hidden directory next to their target.
 """
 
 import contextlib
@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -23,8 +23,6 @@ try:
 except ImportError:  # Windows has no such locks.
     fcntl = None  # type: ignore[assignment]
 
-Clashes = Callable[[str], bool]
-"""Predicate: True for a user's file (its path in the directory) that conflicts with the files of jaxphoto."""
 MARKER = ".jaxphoto.json"
 _PREFIX = ".jaxphoto-"
 # Files created by file managers in every directory they display.
@@ -61,63 +59,61 @@ def whole_file(path: Path) -> Iterator[Path]:
         raise InputError(f"{path} exists and is not a regular file: name a file")
     with _work_place(target) as work:
         yield work
-        _flush(work)
-        if target.exists():
-            shutil.copymode(target, work)
         os.replace(work, target)
 
 
 @contextmanager
-def whole_folder(directory: Path, clashes: Clashes = lambda name: False) -> Iterator[Path]:
-    """Yield a directory to write into, which replaces `directory` when it is complete.
+def whole_folder(directory: Path) -> Iterator[Path]:
+    """Yield a directory to write into, whose files replace those in `directory` when it is complete.
 
     Files previously written there by jaxphoto are removed, all others are retained. After an error nothing has changed.
-    Raises InputError as `check_folder`, OSError if it cannot be written.
+    Raises InputError as `check_folder` and for a file that jaxphoto did not write, OSError if it cannot be written.
     """
     target = _real(directory)
-    check_folder(directory, clashes=clashes)
+    check_folder(directory)
     with _work_place(target) as work:
         work.mkdir()
         yield work
         files = {name: _digest(work / name) for name in _files(work) if name != MARKER}
-        text = json.dumps({"written by": "jaxphoto", "files": files}, indent=1)
-        (work / MARKER).write_text(text + "\n", encoding="utf-8")
+        (work / MARKER).write_text(json.dumps({"written by": "jaxphoto", "files": files}, indent=1) + "\n")
+        written = _listed(target) or {}
+        for name in files:
+            if name not in written and os.path.lexists(target / name) and Path(name).name not in _DEBRIS:
+                raise InputError(
+                    f"{target / name} was not written by jaxphoto and would be lost: move it away, or name a new folder"
+                )
+        for name in written.keys() - files.keys():
+            (target / name).unlink(missing_ok=True)
         for name in (*files, MARKER):
-            _flush(work / name)
-        if target.exists():
-            _keep_foreign(target, work, _written(target, clashes))
-            shutil.copymode(target, work)
-            old = work.with_name(f"{target.name}.old")
-            os.rename(target, old)
-            try:
-                os.rename(work, target)
-            except BaseException:
-                os.rename(old, target)
-                raise
-        else:
-            os.rename(work, target)
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            os.replace(work / name, target / name)
 
 
-def check_folder(directory: Path, *inputs: Path, clashes: Clashes = lambda name: False) -> None:
-    """Raise InputError if `directory` cannot be written or replaced without loss.
+def check_folder(directory: Path, *inputs: Path) -> None:
+    """Raise InputError if `directory` cannot be written without loss.
 
-    Reasons: it is a file; a directory that jaxphoto did not write, or with a file that was modified since or that
-    `clashes`; it contains one of the `inputs`; permissions or disk space are insufficient.
+    Reasons: it is a file; a directory that jaxphoto did not write, or with a file that was modified since; it contains
+    one of the `inputs`; permissions or disk space are insufficient.
     """
     target = _real(directory)
     for given in inputs:
         if target in (real := _real(given), *real.parents):
             raise InputError(f"{directory} is or contains the input {given}, which would be lost: name another folder")
     _check_parents(target, "name a folder")
-    if os.path.ismount(target):
-        raise InputError(f"{directory} is a mount point, which cannot be replaced: name a folder in it")
     if os.path.lexists(target) and not target.is_dir():
         raise InputError(f"{target} is a file: name a folder")
     check_room(target)
     if target.is_dir():
         if not os.access(target, os.W_OK):
             raise InputError(f"{directory} is read-only: name another folder, or change its permissions")
-        _written(target, clashes)
+        listed = _listed(target)
+        if listed is None and set(os.listdir(target)) - _DEBRIS:
+            raise InputError(f"{directory} is not empty and was not written by jaxphoto: name a new folder")
+        for name, digest in (listed or {}).items():
+            if (path := target / name).is_file() and _digest(path) != digest:
+                raise InputError(
+                    f"{path} was changed since jaxphoto wrote it, and would be lost: move it away, or name a new folder"
+                )
 
 
 def check_file(path: Path, *inputs: Path) -> None:
@@ -189,60 +185,15 @@ def _work_place(target: Path) -> Iterator[Path]:
             raise
         raise OSError(error.errno, os.strerror(error.errno), str(target)) from error
     finally:
-        if place is not None and (target.exists() or not (place / f"{target.name}.old").exists()):
+        if place is not None:
             shutil.rmtree(place, ignore_errors=True)
-
-
-def _written(folder: Path, clashes: Clashes) -> set[str]:
-    """Return the files that jaxphoto wrote in `folder`. Raises InputError if replacing them could lose data."""
-    if not set(os.listdir(folder)) - _DEBRIS:
-        return set()
-    listed = _listed(folder)
-    if listed is None:
-        raise InputError(f"{folder} is not empty and was not written by jaxphoto: name a new folder")
-    for name, digest in listed.items():
-        path = folder / name
-        if os.path.lexists(path) and (path.is_symlink() or not path.is_file() or _digest(path) != digest):
-            raise InputError(
-                f"{path} was changed since jaxphoto wrote it, and would be lost: move it away, or name a new folder"
-            )
-    for name in _files(folder):
-        if name not in listed and name != MARKER and Path(name).name not in _DEBRIS and clashes(name):
-            raise InputError(
-                f"{folder / name} was not written by jaxphoto and would be read together with the new files: "
-                "move it away, or name a new folder"
-            )
-    return set(listed)
-
-
-def _keep_foreign(old: Path, new: Path, written: set[str]) -> None:
-    """Link all files that jaxphoto did not write from `old` into `new`. Raises InputError if a name already exists
-    there.
-    """
-    for root, folders, names in os.walk(old):
-        inside = Path(root).relative_to(old)
-        links = [name for name in folders if (Path(root) / name).is_symlink()]
-        for name in (*names, *links):
-            path, to = Path(root) / name, new / inside / name
-            if str(inside / name) in written or name in {MARKER, *_DEBRIS}:
-                continue
-            if os.path.lexists(to) or any(parent.is_file() for parent in to.parents):
-                raise InputError(
-                    f"{path} was not written by jaxphoto and would be lost: move it away, or name a new folder"
-                )
-            to.parent.mkdir(parents=True, exist_ok=True)
-            try:
-                os.link(path, to, follow_symlinks=False)
-            except (OSError, NotImplementedError):  # The file system does not support hard links.
-                shutil.copy2(path, to, follow_symlinks=False)
 
 
 def _listed(folder: Path) -> dict[str, str] | None:
     """Return the content of the marker; None without a valid one."""
     try:
-        files = json.loads((folder / MARKER).read_text(encoding="utf-8"))["files"]
-        return files if all(isinstance(digest, str) for digest in files.values()) else None
-    except (OSError, ValueError, TypeError, KeyError, AttributeError):
+        return dict(json.loads((folder / MARKER).read_text(encoding="utf-8"))["files"])
+    except (OSError, ValueError, TypeError, KeyError):
         return None
 
 
@@ -259,14 +210,6 @@ def _check_parents(target: Path, cure: str) -> None:
     for parent in target.parents:
         if os.path.lexists(parent) and not parent.is_dir():
             raise InputError(f"{parent} is a file: {cure}")
-
-
-def _flush(path: Path) -> None:
-    """Flush a file to disk; some file systems report only here that the disk is full."""
-    if path.is_symlink() or not path.is_file():
-        return
-    with contextlib.closing(os.fdopen(os.open(path, os.O_RDONLY))) as file:
-        os.fsync(file.fileno())
 
 
 def _real(path: Path) -> Path:

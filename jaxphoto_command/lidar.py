@@ -63,15 +63,16 @@ def lidar_control(
     """Add the heights of laser points at tie points as control, and write the block."""
     import numpy as np
 
-    from jaxphoto.io.block_folder import check_block_target, whole_block
+    from jaxphoto.io.block_folder import whole_block
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.procedures.lidar import lidar_control
     from jaxphoto.procedures.lidar.vertical_control import flag_counts
     from jaxphoto.report.lidar import heights_figure, heights_page, heights_table, print_rounds, rounds_table
+    from jaxphoto.writing import check_folder
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
     selection = {"classes": opt.class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
-    check_block_target(out, block, cloud)
+    check_folder(out, block, cloud)
     with output.progress("reading the block") as progress:
         read, points = _block_and_cloud(block, cloud, selection, progress)
         report = _report_rounds(progress)
@@ -111,14 +112,14 @@ def roof_control(
 ) -> None:
     """Constrain tie points to roof planes, and roof centroids in X, Y and Z; write the block."""
     from jaxphoto.io import write_block
-    from jaxphoto.io.block_folder import check_block_target
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.procedures.lidar import roof_control
     from jaxphoto.report.lidar import print_rounds
+    from jaxphoto.writing import check_folder
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=0.0)
     selection = {"classes": opt.class_numbers(classes), "returns": returns, "epsg": cloud_epsg, "unit": cloud_unit}
-    check_block_target(out, block, cloud)
+    check_folder(out, block, cloud)
     with output.progress("reading the block") as progress:
         read, points = _block_and_cloud(block, cloud, selection, progress)
         options: dict[str, Any] = {"max_rounds": max_rounds, "report": _report_rounds(progress)}

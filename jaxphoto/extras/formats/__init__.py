@@ -15,7 +15,6 @@ from jaxphoto.extras.formats.convert import (
     FORMS,
     LOSS_PX,
     Exported,
-    check_export_target,
     convert,
     export,
     read_control,
@@ -28,6 +27,6 @@ from jaxphoto.extras.formats.project import ControlPoints, Project
 
 __all__ = [
     "CAMERAS_WRITTEN", "CAMERA_FORMATS", "CAMERA_MODELS", "CONTROL_FORMATS", "EXPORTS", "FORMATS", "FORMS", "LOSS_PX",
-    "ControlPoints", "Exported", "Project", "ProjectCamera", "check_export_target", "convert", "export", "read_control",
+    "ControlPoints", "Exported", "Project", "ProjectCamera", "convert", "export", "read_control",
     "read_source", "read_tables", "recognise", "write_camera_file",
 ]  # fmt: skip

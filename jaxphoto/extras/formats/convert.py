@@ -174,7 +174,7 @@ def export(project: Project, folder: str | Path, format: str) -> Exported:
         raise InputError(f"unknown export format {format!r}; choose one of {', '.join(EXPORTS)}")
     chosen, folder = EXPORTS[format], Path(folder)
     assert chosen.write is not None
-    check_export_target(folder)
+    check_folder(folder)
     cameras = {name: _converted(project, name, chosen) for name in project.cameras}
     if project.changes:
         corrections = ", ".join(project.changes)
@@ -186,15 +186,10 @@ def export(project: Project, folder: str | Path, format: str) -> Exported:
     if chosen.keeps_rays:
         written = written._replace(column_row=radial.on_same_rays(project, cameras))
         moved = _misfit(written.column_row - project.column_row)
-    with whole_folder(folder, lambda name: True) as work:
+    with whole_folder(folder) as work:
         chosen.write(written, work)
     on_map = chosen.in_map and project.frame.kind == "epsg"
     return Exported(cameras, map_misfit(project) if on_map else None, moved)
-
-
-def check_export_target(folder: Path, *inputs: Path) -> None:
-    """Raise InputError if the folder is not writable or not empty: programs would read other files in it."""
-    check_folder(folder, *inputs, clashes=lambda name: True)
 
 
 def _converted(project: Project, name: str, format: Format) -> Conversion:
