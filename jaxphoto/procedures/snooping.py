@@ -280,7 +280,7 @@ def _name_exchanges(at: Adjustment, left: RowMasks, lost: Int[np.ndarray, "n"], 
         which += [k] * len(some)
     _, valid = _intersect(at, np.array(rows, int), np.array(which, int), 2 * len(pairs), sigma0)
     used: set[int] = set()
-    for (a, b), both in zip(pairs, valid.reshape(-1, 2).all(axis=1), strict=True):
+    for (a, b), both in zip(pairs, valid.reshape(-1, 2).all(axis=1).tolist(), strict=True):
         if both and not used & {a, b}:
             used |= {a, b}
             names = f"{block.points[p.point[a]]} and {block.points[p.point[b]]}"
