@@ -15,7 +15,6 @@ Sources: Huber (1981), Robust statistics, chapters 6 and 7; Lange, Little and Ta
 import dataclasses
 from collections.abc import Callable, Iterator, Mapping
 from functools import cache, partial
-from types import MappingProxyType
 from typing import NamedTuple
 
 import numpy as np
@@ -198,9 +197,13 @@ def restore_points(unknowns: Unknowns, before: Unknowns, point: np.ndarray) -> U
     return dataclasses.replace(unknowns, points=points)
 
 
+# Maximum residual with full weight, in standard deviations (Huber; 95 % efficiency).
+_HUBER = 1.345
+_ROBUST_STEPS = 10
 # Weight factor of control and stations just sufficient for the datum; weight factor that ignores them unless nothing
 # else determines the block.
 _LOOSE, _NOTHING = 1e-4, 1e-12
+_CONVERGED = 0.02
 
 
 class InitialSolution(NamedTuple):
@@ -223,21 +226,22 @@ def initial_solutions(
 ) -> Iterator[Callable[[], InitialSolution]]:
     """Yield initial solutions to try until one fits; with a `loss` only one. Raises the errors of `adjust`."""
 
+    def robustly(loss: AbstractLoss) -> InitialSolution:
+        begun = robust(block, loss, from_all(), max_steps=max_steps, sizes=sizes, report=report)
+        return InitialSolution(begun.at, redundancy_blocks(begun.at), begun.diverged_points)
+
     @cache
     def from_all() -> Unknowns:
         return start_of(block, report) if start is None else start
 
-    def solution(loss: AbstractLoss, least: Mapping[str, float] = MappingProxyType({})) -> InitialSolution:
-        return _robust_solution(block, from_all(), loss, max_steps, sizes, report, least)
-
     if loss is not None:
-        yield lambda: solution(loss)
+        yield lambda: robustly(loss)
         return
     rows = block.named_observations
     coordinates = [name for name, group in rows.items() if isinstance(group, AbstractCoordinates)]
-    yield lambda: solution(Huber())
-    yield lambda: solution(Tukey())
-    yield lambda: solution(Huber(), dict.fromkeys(coordinates, _LOOSE))
+    yield lambda: _huber_solution(block, from_all(), max_steps, sizes, report, {})
+    yield lambda: robustly(Tukey())
+    yield lambda: _huber_solution(block, from_all(), max_steps, sizes, report, dict.fromkeys(coordinates, _LOOSE))
     for name in coordinates if len(coordinates) > 1 else ():
         yield partial(_without, block, start, max_steps, sizes, report, {name: np.ones(len(rows[name]), bool)})
 
@@ -274,28 +278,53 @@ def _without(
     none = {name: out.get(name, np.zeros(len(rows), bool)) for name, rows in block.named_observations.items()}
     start = start_of(without_observations(block, none)[0], report) if start is None else start
     least = {name: np.where(rejected, _NOTHING, 1.0) for name, rejected in out.items()}
-    begun = _robust_solution(block, start, Huber(), max_steps, sizes, report, least)
+    begun = _huber_solution(block, start, max_steps, sizes, report, least)
     return begun._replace(left=begun.left | {name: begun.left[name] | rejected for name, rejected in out.items()})
 
 
-def _robust_solution(
+def _huber_solution(
     block: Block,
     start: Unknowns,
-    loss: AbstractLoss,
     max_steps: int,
     sizes: PaddedSizes,
     report: Callable[[str], object],
     least: Mapping[str, float | np.ndarray],
 ) -> InitialSolution:
-    """Adjust with a robust loss. The weights of groups are multiplied by `least`."""
-    rows = block.named_observations
-    lighter = {name: scale_weights(rows[name], np.broadcast_to(f, len(rows[name]))) for name, f in least.items()}
-    begun = robust(block.with_observations(lighter), loss, start, max_steps=max_steps, sizes=sizes, report=report)
-    at = linearise(block, begun.unknowns, block.priors, sizes) if least else begun.at
-    return InitialSolution(at, redundancy_blocks(at), begun.diverged_points)
+    """Adjust with Huber weights. Initial weights are `least` by group; the default is 1."""
+    rows, unknowns = block.named_observations, start
+    weight = {name: np.broadcast_to(least.get(name, 1.0), len(group)) for name, group in rows.items()}
+    least = weight
+    left = {name: np.zeros(len(group), bool) for name, group in rows.items()}
+    at: Adjustment | None = None
+    r: RedundancyBlocks = {}
+    for step in range(_ROBUST_STEPS + 1):
+        report(f"robust step {step}" if step else "adjusting all observations")
+        lighter = block.with_observations({name: scale_weights(group, weight[name]) for name, group in rows.items()})
+        adjusted, point, left = solve_without_diverged(lighter, left, unknowns, max_steps, sizes)
+        unknowns = restore_points(adjusted.unknowns, unknowns, point)
+        at = linearise(block, unknowns, block.priors, sizes)
+        r = r or redundancy_blocks(at)
+        scale = residual_scales(at, r)
+        new = {
+            name: least[name] / np.maximum(_largest_normalised(at, name, r) / (_HUBER * scale[name]), 1.0)
+            for name in rows
+        }
+        if max(float(np.abs(new[name] - weight[name]).max(initial=0.0)) for name in rows) < _CONVERGED:
+            break
+        weight = new
+    assert at is not None
+    return InitialSolution(at, r, left)
 
 
 def scale_weights(rows: AbstractObservations, weight: Float[np.ndarray, "_"]) -> AbstractObservations:
     """Scale the weights of rows, one factor per row."""
     factor = (weight**-0.5).reshape(-1, *[1] * (np.ndim(rows.sigmas) - 1))
     return rows.with_sigmas_times(np.broadcast_to(factor, np.shape(rows.sigmas)))
+
+
+def _largest_normalised(at: Adjustment, name: str, r: RedundancyBlocks) -> Float[np.ndarray, "_"]:
+    """Return the largest |v| / sqrt(r) of each row; 0 if its redundancy is negligible."""
+    diagonal = np.diagonal(r[name], axis1=1, axis2=2).T
+    checked = diagonal > LEAST_CHECKED
+    size = np.abs(np.atleast_2d(at.residuals[name])) / np.sqrt(np.where(checked, diagonal, 1.0))
+    return np.where(checked, size, 0.0).max(axis=0, initial=0.0)

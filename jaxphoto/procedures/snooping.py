@@ -281,8 +281,9 @@ def _name_exchanges(at: Adjustment, left: RowMasks, lost: Int[np.ndarray, "n"], 
     _, valid = _intersect(at, np.array(rows, int), np.array(which, int), 2 * len(pairs), sigma0)
     used: set[int] = set()
     for (a, b), both in zip(pairs, valid.reshape(-1, 2).all(axis=1).tolist(), strict=True):
-        if both and not used & {a, b}:
-            used |= {a, b}
+        # Two points with two rays each, in the same images: exchange them in one image.
+        if both and not used & {int(p.point[a]), int(p.point[b])}:
+            used |= {int(p.point[a]), int(p.point[b])}
             names = f"{block.points[p.point[a]]} and {block.points[p.point[b]]}"
             words = f"points {names} of image {block.images[p.image[a]]} had each other's name"
             yield Exchange(p.group, ((a, b),), words)
