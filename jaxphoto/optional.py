@@ -8,7 +8,6 @@ EXTRAS = {
     "cv2": "photos", "pycolmap": "photos", "yaml": "photos",
     "pyarrow": "parquet",
     "plotly": "report", "xarray": "report",
-    "blackjax": "posterior",
 }  # fmt: skip
 """Extra of jaxphoto that installs each optional module."""
 
