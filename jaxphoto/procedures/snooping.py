@@ -280,7 +280,7 @@ def _name_exchanges(at: Adjustment, left: RowMasks, lost: Int[np.ndarray, "n"], 
         which += [k] * len(some)
     _, valid = _intersect(at, np.array(rows, int), np.array(which, int), 2 * len(pairs), sigma0)
     used: set[int] = set()
-    for (a, b), both in zip(pairs, valid.reshape(-1, 2).all(axis=1).tolist(), strict=True):
+    for (a, b), both in zip(pairs, (valid[::2] & valid[1::2]).tolist(), strict=True):
         # Two points with two rays each, in the same images: exchange them in one image.
         if both and not used & {int(p.point[a]), int(p.point[b])}:
             used |= {int(p.point[a]), int(p.point[b])}

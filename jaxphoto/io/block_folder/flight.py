@@ -211,4 +211,5 @@ def _near(records: Records, times: np.ndarray) -> Records:
     np.add.at(change, np.clip(at - _MARGIN, 0, n - SHORTEST), 1)
     np.add.at(change, np.clip(at + _MARGIN, SHORTEST, n), -1)
     chosen = np.cumsum(change[:-1]) > 0
-    return records._replace(**{n: v[chosen] for n, v in records._asdict().items() if isinstance(v, np.ndarray)})
+    columns: dict[str, Any] = {n: v[chosen] for n, v in records._asdict().items() if isinstance(v, np.ndarray)}
+    return records._replace(**columns)
