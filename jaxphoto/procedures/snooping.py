@@ -79,7 +79,7 @@ _BESIDE_THE_WORST = 0.5
 # Maximum ratio of the distance from another object's observation to the distance from the next nearest.
 _NEAR = 0.2
 # Maximum factor by which a point may be nearer than the nearest, or farther than the farthest, points of the block.
-_DEPTH = 1.5
+_DEPTH, _ANY_MISCLOSURE = 1.5, 1e6
 
 
 @pretty_repr
@@ -296,9 +296,19 @@ def _coordinate_exchanges(at: Adjustment, left: RowMasks) -> Iterator[Exchange]:
         if not isinstance(observed, AbstractCoordinates) or len(observed.indices()) != 1:
             continue
         ((what, who),) = ((what, to_numpy(index)) for what, index in observed.indices())
-        value, error = to_numpy(observed.value), to_numpy(observed.physical(at.residuals[group]))
+        value, error = to_numpy(observed.value), np.array(to_numpy(observed.physical(at.residuals[group])))
+        suspects = np.unique(who[left[group]])
+        if what == "point":
+            # Wrong coordinates may stay and reject all rays: intersect these, whatever their misclosure.
+            p = block.image_points
+            suspects = np.union1d(suspects, np.intersect1d(who, p.point[left[p.group]]))
+            rays = np.flatnonzero(np.isin(p.point, suspects))
+            which = np.searchsorted(suspects, p.point[rays])
+            places, valid = _intersect(at, rays, which, len(suspects), _ANY_MISCLOSURE)
+            for k in np.flatnonzero(np.isin(who, suspects[valid])):
+                error[k] = value[k] - places[np.searchsorted(suspects, who[k]), observed.axis[k]]
         by_axes: dict[tuple[int, ...], list[np.ndarray]] = {}
-        for k in np.unique(who[left[group]]).tolist():
+        for k in suspects.tolist():
             rows = np.flatnonzero(who == k)
             rows = rows[np.argsort(observed.axis[rows])]
             by_axes.setdefault(tuple(observed.axis[rows].tolist()), []).append(rows)

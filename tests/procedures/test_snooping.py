@@ -155,7 +155,7 @@ def test_exchanged_names_of_points_of_two_rays():
     ("group", "one", "other"),
     [
         # Of many images; such that the first beginning leaves sound rows out, and others seem exchanged.
-        ("control_points", "T16", "T21"), ("control_points", "T15", "T31"),
+        ("control_points", "T10", "T12"), ("control_points", "T16", "T21"), ("control_points", "T15", "T31"),
         # The second and the third beginning find it.
         ("control_points", "T11", "T17"), ("stations", "B1", "C1"),
         ("stations", "B7", "B8"),
