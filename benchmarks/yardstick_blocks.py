@@ -127,7 +127,7 @@ def experiment_systematics() -> Blocks:
 
 @case
 def experiment_posterior() -> Blocks:
-    recipe = tomllib.loads((ROOT / "experiments/posterior/recipe.toml").read_text(encoding="utf-8"))
+    recipe = tomllib.loads((ROOT / "benchmarks/yardstick/flat_block.toml").read_text(encoding="utf-8"))
     blocks = {"without stations": jaxphoto.simulate(recipe_from(recipe), seed=1).block}
     recipe["sigmas"]["station_m"] = recipe["noise"]["station_m"] = 0.1
     return blocks | {"with stations": jaxphoto.simulate(recipe_from(recipe), seed=1).block}

@@ -7,7 +7,6 @@ EXTRAS = {
     "laspy": "lidar", "lazrs": "lidar",
     "rasterio": "photos", "cv2": "photos", "pycolmap": "photos",
     "pyarrow": "parquet",
-    "blackjax": "posterior",
 }  # fmt: skip
 """Extra of jaxphoto that installs each optional module."""
 

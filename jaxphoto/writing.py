@@ -11,7 +11,7 @@ import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import NamedTuple
@@ -23,8 +23,6 @@ try:
 except ImportError:  # Windows has no such locks.
     fcntl = None  # type: ignore[assignment]
 
-Clashes = Callable[[str], bool]
-"""Predicate: True for a user's file (its path in the directory) that conflicts with the files of jaxphoto."""
 MARKER = ".jaxphoto.json"
 _PREFIX = ".jaxphoto-"
 # Files created by file managers in every directory they display.
@@ -68,14 +66,14 @@ def whole_file(path: Path) -> Iterator[Path]:
 
 
 @contextmanager
-def whole_folder(directory: Path, clashes: Clashes = lambda name: False) -> Iterator[Path]:
+def whole_folder(directory: Path) -> Iterator[Path]:
     """Yield a directory to write into, which replaces `directory` when it is complete.
 
     Files previously written there by jaxphoto are removed, all others are retained. After an error nothing has changed.
     Raises InputError as `check_folder`, OSError if it cannot be written.
     """
     target = _real(directory)
-    check_folder(directory, clashes=clashes)
+    check_folder(directory)
     with _work_place(target) as work:
         work.mkdir()
         yield work
@@ -85,7 +83,7 @@ def whole_folder(directory: Path, clashes: Clashes = lambda name: False) -> Iter
         for name in (*files, MARKER):
             _flush(work / name)
         if target.exists():
-            _keep_foreign(target, work, _written(target, clashes))
+            _keep_foreign(target, work, _written(target))
             shutil.copymode(target, work)
             old = work.with_name(f"{target.name}.old")
             os.rename(target, old)
@@ -98,11 +96,11 @@ def whole_folder(directory: Path, clashes: Clashes = lambda name: False) -> Iter
             os.rename(work, target)
 
 
-def check_folder(directory: Path, *inputs: Path, clashes: Clashes = lambda name: False) -> None:
+def check_folder(directory: Path, *inputs: Path) -> None:
     """Raise InputError if `directory` cannot be written or replaced without loss.
 
-    Reasons: it is a file; a directory that jaxphoto did not write, or with a file that was modified since or that
-    `clashes`; it contains one of the `inputs`; permissions or disk space are insufficient.
+    Reasons: it is a file; a directory that jaxphoto did not write, or with a file that was modified since;
+    it contains one of the `inputs`; permissions or disk space are insufficient.
     """
     target = _real(directory)
     for given in inputs:
@@ -117,7 +115,7 @@ def check_folder(directory: Path, *inputs: Path, clashes: Clashes = lambda name:
     if target.is_dir():
         if not os.access(target, os.W_OK):
             raise InputError(f"{directory} is read-only: name another folder, or change its permissions")
-        _written(target, clashes)
+        _written(target)
 
 
 def check_file(path: Path, *inputs: Path) -> None:
@@ -193,7 +191,7 @@ def _work_place(target: Path) -> Iterator[Path]:
             shutil.rmtree(place, ignore_errors=True)
 
 
-def _written(folder: Path, clashes: Clashes) -> set[str]:
+def _written(folder: Path) -> set[str]:
     """Return the files that jaxphoto wrote in `folder`. Raises InputError if replacing them could lose data."""
     if not set(os.listdir(folder)) - _DEBRIS:
         return set()
@@ -205,12 +203,6 @@ def _written(folder: Path, clashes: Clashes) -> set[str]:
         if os.path.lexists(path) and (path.is_symlink() or not path.is_file() or _digest(path) != digest):
             raise InputError(
                 f"{path} was changed since jaxphoto wrote it, and would be lost: move it away, or name a new folder"
-            )
-    for name in _files(folder):
-        if name not in listed and name != MARKER and Path(name).name not in _DEBRIS and clashes(name):
-            raise InputError(
-                f"{folder / name} was not written by jaxphoto and would be read together with the new files: "
-                "move it away, or name a new folder"
             )
     return set(listed)
 

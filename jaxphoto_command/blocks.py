@@ -63,7 +63,7 @@ def adjust(
     from jaxphoto.io import read_block, read_truth, write_block
     from jaxphoto.losses import LOSSES
     from jaxphoto.procedures.adjust import adjust_for_tables
-    from jaxphoto.procedures.blunder_causes import inflated_components
+    from jaxphoto.procedures.snooping import inflated_components
     from jaxphoto.statistics import SPLITS
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.certificate import Provenance
@@ -90,7 +90,7 @@ def adjust(
         if weights is not None and bool(adjusted.converged):
             progress.update("estimating variance components")
             components = jaxphoto.variance_components(adjusted, splits, max_steps=max_steps)
-            masked += inflated_components(adjusted, components, splits, max_steps=max_steps, report=progress.update)
+            masked += inflated_components(adjusted, components, splits, max_steps=max_steps)
             adjusted = components.adjusted
         progress.update("computing statistics")
         tables = jaxphoto.Tables(adjusted, rotations, read_truth(block))  # type: ignore[arg-type]

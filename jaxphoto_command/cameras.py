@@ -1,4 +1,4 @@
-"""Commands that compare and combine calibrations."""
+"""Commands that compare calibrations."""
 
 import time
 from pathlib import Path
@@ -91,74 +91,6 @@ def compare(
     if out is not None:
         write_change(result, sets, a.sensor, out, output.command_record(first, second))
         output.wrote(out, f"results in {out} (open report.html)")
-
-
-@command("combine", PANEL, "jaxphoto combine 2023 2024 2025 --out camera.toml")
-def combine(
-    output: Output,
-    calibrations: Annotated[list[Path], Argument(help="Results or camera files with a covariance.")],
-    out: Annotated[Path, Option(help="Camera file (.toml) to write; it can be a prior of blocks.")],
-    camera: opt.Camera = None,
-) -> None:
-    """Combine calibrations of one camera by their full covariances.
-
-    Exit code 1: result written, but the calibrations disagree.
-    """
-    import numpy as np
-
-    from jaxphoto.camera import get_parameter, parameter_names
-    from jaxphoto.errors import InputError
-    from jaxphoto.extras.formats import write_camera_file
-    from jaxphoto.io.camera_files import read_camera_file
-    from jaxphoto.stability import combine
-    from jaxphoto.stability.comparison import SIGNIFICANT_P
-    from jaxphoto.writing import check_file
-    from jaxphoto_command.certificate import check_one_sensor
-
-    if out.suffix != ".toml":
-        raise typer.BadParameter(f"--out {out}: only a .toml file can contain the covariance.")
-    check_file(out, *calibrations)
-    files = {str(path): read_camera_file(path, camera=camera) for path in calibrations}
-    first = files[str(calibrations[0])]
-    covariances = []
-    for name, file in files.items():
-        check_one_sensor(first, file, calibrations[0], Path(name))
-        if file.covariance is None:
-            raise InputError(
-                f"{name} has no covariance; give a result folder of jaxphoto adjust, or a camera file written from one"
-            )
-        covariances.append(file.covariance)
-        if file.note:
-            output.warn(f"{name}: {file.note}")
-    result = combine([file.interior for file in files.values()], covariances, list(files))
-    notes = "; ".join(f"{name}: {file.note}" for name, file in files.items() if file.note)
-    write_camera_file(
-        out, first.sensor, result.interior, "block", name=first.name, covariance=result.covariance, reservation=notes
-    )
-    for parameter, variance in zip(parameter_names(result.interior), np.diagonal(result.covariance), strict=True):
-        if variance > 0:
-            value = float(get_parameter(result.interior, parameter))
-            output.say(f"  {parameter} = {value:.9g} +- {variance**0.5:.2g}")
-    agree = result.p_value >= SIGNIFICANT_P
-    verdict = "they agree" if agree else "they disagree: the camera has changed, or the covariances are too small"
-    output.say(
-        f"chi-square {result.chi_square:.1f}, {result.degrees_of_freedom} degrees of freedom, "
-        f"p = {result.p_value:.2g}: {verdict}"
-    )
-    p_values = dict(zip(files, result.against_others, strict=True))
-    for k, (name, p) in enumerate(p_values.items()):
-        note = ": it disagrees" if len(files) > 2 and k in result.disagreeing(SIGNIFICANT_P) else ""
-        output.say(f"  {name} and the others: p = {p:.2g}{note}")
-    output.wrote(out, f"wrote {out}")
-    output.add(
-        agree=agree,
-        chi_square=result.chi_square,
-        degrees_of_freedom=result.degrees_of_freedom,
-        p_value=result.p_value,
-        p_against_others=p_values,
-    )
-    if not agree:
-        raise typer.Exit(1)
 
 
 @command(

@@ -35,7 +35,6 @@ def example(
     import shutil
 
     from jaxphoto.io import read_recipe, write_simulation
-    from jaxphoto.io.block_folder import check_block_target
     from jaxphoto.io.shipped import EXAMPLES, shipped
     from jaxphoto.simulation import simulate
     from jaxphoto.writing import check_file, check_folder, whole_file, whole_folder
@@ -47,7 +46,7 @@ def example(
     source = shipped(name)
     target = out if out is not None else Path(name if source.is_dir() or name in _SIMULATED else source.name)
     if name in _SIMULATED:
-        check_block_target(target, source)
+        check_folder(target, source)
         with output.progress("simulating"):
             write_simulation(simulate(read_recipe(source)), target)
     elif source.is_dir():
@@ -72,11 +71,11 @@ def simulate(
 ) -> None:
     """Simulate a block with known true parameters."""
     from jaxphoto.io import read_recipe, write_simulation
-    from jaxphoto.io.block_folder import check_block_target
     from jaxphoto.io.recipe.truth import CLOUD, TRAJECTORY
     from jaxphoto.simulation import simulate
+    from jaxphoto.writing import check_folder
 
-    check_block_target(out, recipe)
+    check_folder(out, recipe)
     with output.progress("simulating") as progress:
         simulation = simulate(read_recipe(recipe), seed)
         progress.update(f"writing {out}")

@@ -42,11 +42,11 @@ def convert(
     adjust: Annotated[bool, Option("--adjust", help="Adjust the block in SOURCE first.")] = False,
 ) -> None:
     """Convert files of other programs to a block folder, or a block or results to files of other programs."""
-    from jaxphoto.extras.formats import EXPORTS, Project, check_export_target, export, read_source
+    from jaxphoto.extras.formats import EXPORTS, Project, export, read_source
     from jaxphoto.io import write_block
-    from jaxphoto.io.block_folder import check_block_target
     from jaxphoto.io.camera_files import ASSUMED_PIXEL_MM
     from jaxphoto.io.result_folder import adjusted_block, is_result, photograph_files
+    from jaxphoto.writing import check_folder
 
     out = _target(out, second)
     result = source_format is None and is_result(source)
@@ -56,7 +56,7 @@ def convert(
         raise typer.BadParameter(f"--block and --part apply to results only; {source} is not a result folder.")
     if out.suffix.lower() in {suffix for known in EXPORTS.values() for suffix in known.endings}:
         raise typer.BadParameter(f"--out {out}: {to} is a folder of files; omit {out.suffix}.")
-    (check_block_target if to == "block" else check_export_target)(out, source)
+    check_folder(out, source)
     if to != "block" and to not in EXPORTS:
         raise typer.BadParameter(f"--to {to}: unknown format; choose one of block, {', '.join(EXPORTS)}.")
     lacks: Any = EXPORTS[to].lacks if to in EXPORTS else ()

@@ -63,14 +63,15 @@ def lidar_control(
     """Add the heights of laser points at tie points as control, and write the block."""
     import numpy as np
 
-    from jaxphoto.io.block_folder import check_block_target, whole_block
+    from jaxphoto.io.block_folder import whole_block
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.procedures.lidar import lidar_control
     from jaxphoto.procedures.lidar.vertical_control import flag_counts
     from jaxphoto.report.lidar import heights_page, heights_table, rounds_table, rounds_words
+    from jaxphoto.writing import check_folder
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
-    check_block_target(out, block, cloud)
+    check_folder(out, block, cloud)
     with output.progress("reading the block") as progress:
         read, points = _block_and_cloud(block, cloud, opt.selection(classes, returns, cloud_epsg), progress)
         report = _report_rounds(progress)
@@ -107,13 +108,13 @@ def roof_control(
 ) -> None:
     """Constrain tie points to roof planes, and roof centroids in X, Y and Z; write the block."""
     from jaxphoto.io import write_block
-    from jaxphoto.io.block_folder import check_block_target
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.procedures.lidar import roof_control
     from jaxphoto.report.lidar import rounds_words
+    from jaxphoto.writing import check_folder
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=0.0)
-    check_block_target(out, block, cloud)
+    check_folder(out, block, cloud)
     with output.progress("reading the block") as progress:
         read, points = _block_and_cloud(block, cloud, opt.selection(classes, returns, cloud_epsg), progress)
         options: dict[str, Any] = {"max_rounds": max_rounds, "report": _report_rounds(progress)}
@@ -494,7 +495,7 @@ def _block_and_cloud(block: Path, cloud: Path, selection: dict[str, Any], progre
     """Read a block, and the part of the cloud near its points."""
     import numpy as np
 
-    from jaxphoto.initial import approximate
+    from jaxphoto.initial.approximate import approximate
     from jaxphoto.io import clouds, read_block
 
     read = read_block(block)

@@ -378,7 +378,7 @@ def orient(
     from jaxphoto.extras.photos.features import LONGEST_PX
     from jaxphoto.extras.photos.matching import match_photographs
     from jaxphoto.extras.photos.photograph_pairs import photograph_pairs, usual_choice
-    from jaxphoto.io.block_folder import check_block_target, whole_block
+    from jaxphoto.io.block_folder import whole_block
     from jaxphoto.io.block_folder.table_layout import TOML
     from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
     from jaxphoto.io.photographs import photographs, sensor_and_interior
@@ -386,8 +386,9 @@ def orient(
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.orientation import orient
     from jaxphoto.report.photographs import orientation_sentences, write_orientation
+    from jaxphoto.writing import check_folder
 
-    check_block_target(out, *images)
+    check_folder(out, *images)
     if len(images) == 1 and (images[0] / TOML).is_file():
         values = {
             "pairs": pairs,

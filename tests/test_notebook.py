@@ -22,8 +22,7 @@ from jaxphoto.losses import AbstractLoss
 from jaxphoto.procedures.boresight import BoresightEstimate, Step
 from jaxphoto.procedures.georeference import Georeferenced
 from jaxphoto.procedures.robust import Robust
-from jaxphoto.procedures.snooping import Snooped
-from jaxphoto.procedures.swapped_observations import Exchange
+from jaxphoto.procedures.snooping import Exchange, Snooped
 from jaxphoto.report.findings import Verdict
 from jaxphoto.sensitivity import Readjustment
 from jaxphoto.simulation import Simulation, Terrain

@@ -18,38 +18,10 @@ from jaxphoto.adjustment.normal_equations import (
 )
 from jaxphoto.adjustment.result import Adjustment, Outcome
 from jaxphoto.adjustment.solver.levenberg_marquardt import TOLERANCE, SolveMode, to_factor, to_optimum
-from jaxphoto.adjustment.weak_directions import POOR, WeakDirection, weak_directions, yardsticks
-from jaxphoto.adjustment.weakness_messages import WeakUnknowns, weaknesses_of
 
 __all__ = [
-    "MAX_STEPS",
-    "MINIMAL_SIZES",
-    "POOR",
-    "TOLERANCE",
-    "Adjustment",
-    "Cofactors",
-    "CoupledUnknowns",
-    "Linearised",
-    "NormalEquations",
-    "Outcome",
-    "PaddedBlock",
-    "PaddedResiduals",
-    "PaddedSizes",
-    "PaddedStructure",
-    "PaddedValues",
-    "Problem",
-    "RowCofactors",
-    "SolveMode",
-    "WeakDirection",
-    "WeakUnknowns",
-    "build_problem",
-    "common_sizes",
-    "linearise",
-    "optimise",
-    "solve",
-    "to_factor",
-    "to_optimum",
-    "weak_directions",
-    "weaknesses_of",
-    "yardsticks",
+    "MAX_STEPS", "MINIMAL_SIZES", "TOLERANCE", "Adjustment", "Cofactors", "CoupledUnknowns", "Linearised",
+    "NormalEquations", "Outcome", "PaddedBlock", "PaddedResiduals", "PaddedSizes", "PaddedStructure",
+    "PaddedValues", "Problem", "RowCofactors", "SolveMode", "build_problem", "common_sizes", "linearise",
+    "optimise", "solve", "to_factor", "to_optimum",
 ]  # fmt: skip

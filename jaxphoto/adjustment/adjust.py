@@ -13,7 +13,6 @@ import numpy as np
 
 from jaxphoto.adjustment.arguments import check_arguments
 from jaxphoto.adjustment.datum import close_datum
-from jaxphoto.adjustment.implicit import find_optimum
 from jaxphoto.adjustment.iteration_log import log_iterations
 from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues
 from jaxphoto.adjustment.layout.padding import PaddedBlock, pad_structure
@@ -30,7 +29,6 @@ from jaxphoto.adjustment.solver.levenberg_marquardt import IterationHistory, to_
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import unit_scale, weigh_datum
 from jaxphoto.adjustment.solver.similarity import n_open_motions
-from jaxphoto.adjustment.vmap_rule import image_row_lists
 from jaxphoto.arrays import gathered, is_float, is_traced, to_numpy
 from jaxphoto.block import Block
 from jaxphoto.compiling import prepare, run_compiled
@@ -115,6 +113,9 @@ def _differentiable(values: PaddedValues, padded: PaddedBlock, max_steps: int) -
     """Return the optimum and its state as one program: without it, derivatives would compile every operation
     separately.
     """
+    from jaxphoto.adjustment.implicit import find_optimum
+    from jaxphoto.adjustment.vmap_rule import image_row_lists
+
     s = padded.structure
     found = find_optimum(weigh_datum(values, s), s, to_optimum(max_steps), image_row_lists(padded))
     return found, state_at(found.increments, unit_scale(s), values, s)

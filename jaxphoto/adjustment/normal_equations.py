@@ -14,16 +14,14 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues
 from jaxphoto.adjustment.layout.rays import GROUP
 from jaxphoto.adjustment.model.numbers import Increments, NonImageResiduals, UnknownArrays, state_at, zero_increments
-from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots, solve_band
+from jaxphoto.adjustment.solver.band import Band, dense, factor_band, invert_band, pivots
 from jaxphoto.adjustment.solver.elimination import (
     FactoredNormal,
     j_product,
     j_product_others,
     jt_product,
     jt_product_others,
-    reduce_right,
     solve_factored,
-    solve_reduced,
 )
 from jaxphoto.adjustment.solver.inverse import Cofactors, RowCofactors, cofactors_of, row_variances
 from jaxphoto.adjustment.solver.levenberg_marquardt import IterationHistory, SolveMode
@@ -35,7 +33,7 @@ from jaxphoto.adjustment.solver.reduced import (
     reduce_normal,
     reduced_columns,
 )
-from jaxphoto.arrays import sum_terms, to_numpy
+from jaxphoto.arrays import to_numpy
 from jaxphoto.compiling import call_compiled
 from jaxphoto.short_repr import pretty_repr
 
@@ -104,24 +102,6 @@ class NormalEquations(eqx.Module):
         """Return J Q J' of the image rows, and of every other group as (c, c, ...), c components per row."""
         return row_variances(self.at, q, of_rows, self.factored)
 
-    def reduce(self, b: Increments) -> tuple[Float[Array, "reduced"], Float[Array, "constraints"]]:
-        """Eliminate points from a right-hand side; return its parts for the reduced unknowns and for mu."""
-        return reduce_right(self.factored.reduced, b, self.at)
-
-    def expand(
-        self, right: Float[Array, "reduced"], d: Float[Array, "constraints"], b_points: Float[Array, "3 points"]
-    ) -> Increments:
-        """Solve for x, given a right-hand side from `reduce`."""
-        return solve_reduced(self.factored.reduced, self.factored.factor, right, d, b_points, self.at)
-
-    def solve_reduced_matrix(self, right: Float[Array, "reduced *c"]) -> Float[Array, "reduced *c"]:
-        """Return A^-1 right, for the reduced unknowns."""
-        return solve_band(self.factored.factor, right)
-
-    def cholesky_factor(self) -> Float[Array, "reduced reduced"]:
-        """Return M of the reduced normal matrix A = M M'."""
-        return jnp.tril(dense(Band(*self.factored.factor)))
-
     def inverse_of_reduced(self) -> Float[Array, "reduced reduced"]:
         """Return A^-1."""
         return invert_band(self.factored.factor)
@@ -135,13 +115,6 @@ class NormalEquations(eqx.Module):
     def least_pivot(self) -> Float[Array, ""]:
         """Return the smallest pivot."""
         return jnp.min(self.pivots())
-
-    def gradient(self, increments: Increments) -> tuple[Increments, Float[Array, ""]]:
-        """Return b = J'r at other increments, and the sum of squares r'r there."""
-        at = self.at._replace(increments=increments)
-        residuals = at.residuals()
-        b = jt_product(jax.tree.map(lambda v: v[None], residuals), at)
-        return jax.tree.map(lambda v: v[0], b), sum_terms(jnp.sum(v**2) for v in jax.tree.leaves(residuals))
 
     def constraints(self) -> Increments:
         """Return derivatives of the datum constraints, along a leading axis."""

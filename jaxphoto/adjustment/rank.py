@@ -14,7 +14,6 @@ from jaxphoto.adjustment.result import Adjustment
 from jaxphoto.adjustment.solver.band import Band
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.reduced import reduce_normal
-from jaxphoto.adjustment.weakness_messages import weaknesses_of
 from jaxphoto.arrays import is_traced, to_numpy
 from jaxphoto.block import Block, exposures
 from jaxphoto.camera import RATES, CameraSpline
@@ -226,6 +225,8 @@ def check_rank(adjusted: Adjustment) -> None:
         return
     if adjusted.equations.least_pivot() > DEFECT:
         return
+    from jaxphoto.adjustment.weakness_messages import weaknesses_of
+
     if found := weaknesses_of(adjusted):
         sentences = "; ".join(weakness.sentence for weakness in found)
         points = {p for weakness in found for p in weakness.points} if all(w.points for w in found) else set()

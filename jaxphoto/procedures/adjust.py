@@ -15,13 +15,10 @@ from jaxphoto.arrays import is_traced
 from jaxphoto.block import Block, sensor_rows
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError, DatumError, RankError, few
-from jaxphoto.initial import approximate
-from jaxphoto.initial.approximate import PointsBehind, completed, intersected
+from jaxphoto.initial.approximate import PointsBehind, approximate, completed, intersected
 from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.observations import AbstractObservations, KnownParameters
-from jaxphoto.statistics import prepare_statistics
 from jaxphoto.unknowns import FREE, Unknowns
-from jaxphoto.variants import without_observations
 
 _FromStart = Callable[[Block, Unknowns], Adjustment]
 
@@ -89,6 +86,8 @@ def adjust_for_tables(
 
     `seconds["start"]` of the result includes the search for approximate values.
     """
+    from jaxphoto.statistics import prepare_statistics
+
     spent, began = {"start": 0.0}, time.perf_counter()
 
     def from_start(part: Block, start: Unknowns) -> Adjustment:
@@ -159,8 +158,10 @@ def _without_diverged_points(adjusted: Adjustment, from_start: _FromStart) -> Ad
 
     Their positions are then recomputed. Points that converge and fit are reinstated.
     """
-    if adjusted.factored is None:
+    if adjusted.factored is None or not adjusted.diverged_points.any():
         return adjusted
+    from jaxphoto.variants import without_observations
+
     block, reduced, names = adjusted.block, adjusted, list[str]()
     most = _MAX_DIVERGED * len(block.points)
     while (diverged := reduced.diverged_points).any() and len(names) + diverged.sum() <= most:

@@ -24,7 +24,7 @@ from jaxphoto.adjustment import MAX_STEPS, Adjustment
 from jaxphoto.block import Block, Start
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Mount, StripBias
-from jaxphoto.initial import approximate
+from jaxphoto.initial.approximate import approximate
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.short_repr import pretty_repr

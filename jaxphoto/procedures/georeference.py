@@ -32,7 +32,7 @@ from jaxphoto.georeferencing.intersection_covariance import (
     ray_partials,
     shared_covariance,
 )
-from jaxphoto.initial import intersect_points
+from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.initial.rays import camera_rays, padded_length, turn_to_object
 from jaxphoto.observations import ControlCoordinates
 from jaxphoto.short_repr import pretty_repr

@@ -8,28 +8,30 @@ other units), restart from another solution (`robust.initial_solutions`).
 and reinstated if it agrees; the most significant row of each point is rejected if it contradicts (Baarda's data
 snooping). Stop when no row changes.
 
-3. Correct exchanged coordinates of control points or stations, and exchanged names of image points in one image
-(`exchanges`).
-
-4. Reinstate points that were rejected while blunders distorted the images, if their rays intersect.
+3. Correct exchanges: two rejected image points of an image, control points or stations, each of which is predicted
+where the other was observed. Reinstate points that were rejected while blunders distorted the images, once.
 
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Huber (1981), Robust statistics.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from itertools import combinations
 from typing import NamedTuple
 
 import equinox as eqx
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, PaddedSizes, common_sizes, linearise, solve
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
+from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError, DatumError, JaxphotoError, RankError, counted
 from jaxphoto.initial.approximate import in_front, looking_away
+from jaxphoto.initial.intersection import intersect_points
+from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.losses import AbstractLoss
-from jaxphoto.observations import Correlated
+from jaxphoto.observations import AbstractCoordinates, Correlated
 from jaxphoto.procedures.adjust import start_of
 from jaxphoto.procedures.robust import (
     InitialSolution,
@@ -43,19 +45,23 @@ from jaxphoto.procedures.robust import (
     solve_without_diverged,
     without_common_errors,
 )
-from jaxphoto.procedures.swapped_observations import (
-    Exchange,
-    coordinate_exchanges,
-    exchanged,
-    intersecting_points,
-    merge_exchanges,
-    name_exchanges,
-    reinstate_points,
-    with_dependants,
-    with_positions,
-)
 from jaxphoto.short_repr import pretty_repr
-from jaxphoto.statistics import LEAST_CHECKED, LEAST_SIGMA0, LEVEL, UNCHECKED, Suspect, chi_square_limit, global_test
+from jaxphoto.statistics import (
+    LEAST_CHECKED,
+    LEAST_SIGMA0,
+    LEVEL,
+    UNCHECKED,
+    Partition,
+    Suspect,
+    VarianceComponents,
+    blunder_test,
+    chi_square_limit,
+    covariance,
+    global_test,
+    partition_observations,
+    redundancy_numbers,
+    variance_components,
+)
 from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Unknowns
 
@@ -70,6 +76,20 @@ _SINGLE = 1 / 3
 # Ratio to the largest normalised residual below which a row is not rejected in the same iteration: blunders inflate
 # neighbouring residuals.
 _BESIDE_THE_WORST = 0.5
+# Maximum ratio of the distance from another object's observation to the distance from the next nearest.
+_NEAR = 0.2
+# Maximum factor by which a point may be nearer than the nearest, or farther than the farthest, points of the block.
+_DEPTH, _ANY_MISCLOSURE = 1.5, 1e6
+
+
+@pretty_repr
+class Exchange(NamedTuple):
+    """Rows of a group that exchanged observed values and standard deviations."""
+
+    group: str
+    rows: tuple[tuple[int, int], ...]
+    words: str
+    """Message such as "points 12 and 31 of image A2 had each other's name"."""
 
 
 @pretty_repr
@@ -190,14 +210,8 @@ def _snooped(
     )
     left = {name: flown[name] | worst[name] for name in worst}
     tried: list[RowMasks] = []
-    # Correct exchanges before any rejection: wrong coordinates distort images, so valid rows would be rejected.
-    lost = np.unique(block.image_points.point[flown[block.image_points.group]])
-    done, at = coordinate_exchanges(at, left, lost, sizes)
-    for exchange in done:
-        block, left = exchanged(block, left, exchange)
-    # Exclude repeated exchanges: they would be undone in each iteration.
-    tried_exchanges = {(e.group, e.rows) for e in done}
-    returned, again = set[int](), set[tuple]()
+    done: list[Exchange] = []
+    tried_exchanges, returned = set[Exchange](), set[int]()
     while True:
         report(f"adjusting without {counted(sum(int(m.sum()) for m in left.values()), 'observation')}")
         adjusted, point, left = solve_without_diverged(block, left, at.unknowns, max_steps, sizes)
@@ -205,72 +219,160 @@ def _snooped(
         sigma0 = max(float(adjusted.sigma0), LEAST_SIGMA0)
         lost = np.setdiff1d(np.arange(len(block.points)), point)
         r = predicted_redundancy(at, left, sizes)
-        new, placed = _new_exchanges(at, left, lost, sigma0, r, sizes, tried_exchanges)
-        for exchange in new:
-            (block, left), at = exchanged(block, left, exchange), placed
-            done.append(exchange)
-        if new:
+        # Coordinates first: wrong ones distort images, so names appear to be exchanged.
+        found = lambda pairs: [e for e in pairs if e not in tried_exchanges and sigma0 <= _FITS]  # noqa: B023, E731
+        if new := found(_coordinate_exchanges(at, left)) or found(_name_exchanges(at, left, lost, sigma0)):
+            for exchange in new:
+                block, left = _exchanged(block, left, exchange)
+            done += new
+            tried_exchanges.update(new)
             # The block has changed: earlier sets of rejections may succeed now.
             tried.clear()
             continue
         rejections = _next_rejections(adjusted, at, left, point, sigma0, r)
         still_there = _equal_masks(rejections, left)
-        if still_there or len(tried) == _MAX_ITERATIONS or any(_equal_masks(rejections, old) for old in tried):
-            # Undo exchanges that do not fit or are unnecessary. If the solution does not fit, undo all and allow one
-            # more attempt.
-            fits = bool(adjusted.converged) and sigma0 <= _FITS
-            wrong = [not fits or not _is_necessary(at, left, e, sigma0) for e in done]
-            if undone := with_dependants(done, wrong):
-                for exchange in reversed(undone):
-                    block, left = exchanged(block, left, exchange.undone)
-                    done.remove(exchange)
-                went = set() if fits else {(e.group, e.rows) for e in undone}
-                tried_exchanges, again = tried_exchanges - (went - again), again | went
-                tried.clear()
-                continue
-            # Points rejected while blunders distorted the images.
-            back = {p: place for p, place in intersecting_points(at, left, lost, sigma0).items() if p not in returned}
-            if not still_there or not back:
-                break
-            returned |= set(back)
-            left, at = reinstate_points(block, left, back), with_positions(at, back)
+        if not still_there and len(tried) < _MAX_ITERATIONS and not any(_equal_masks(rejections, t) for t in tried):
+            tried.append(left)
+            left = rejections
+        elif wrong := [e for e in done if left[e.group][np.ravel(e.rows)].mean() >= 0.5]:
+            for exchange in reversed(wrong):
+                out = left
+                block, left = _exchanged(block, left, exchange)
+                left = left | {exchange.group: left[exchange.group] | out[exchange.group]}
+                done.remove(exchange)
             tried.clear()
-            continue
-        tried.append(left)
-        left = rejections
+        elif still_there and len(lost := np.setdiff1d(lost, list(returned))):
+            p, points = block.image_points, np.array(to_numpy(at.unknowns.points))
+            rows = np.flatnonzero(np.isin(p.point, lost))
+            places, valid = _intersect(at, rows, np.searchsorted(lost, p.point[rows]), len(lost), sigma0)
+            if not valid.any():
+                break
+            back = lost[valid]
+            returned.update(back.tolist())
+            points[back] = places[valid]
+            left = left | {p.group: left[p.group] & ~np.isin(p.point, back)}
+            at = eqx.tree_at(lambda a: a.unknowns.points, at, points)
+            tried.clear()
+        else:
+            break
     suspects = _suspects(at, left, _rows_of_points(block, point), r, sigma0)
-    return Snooped(adjusted, suspects, tuple(merge_exchanges(block, done, left)), tuple(block.points[p] for p in lost))
+    return Snooped(adjusted, suspects, tuple(done), tuple(block.points[p] for p in lost))
 
 
-def _new_exchanges(
-    at: Adjustment, left: RowMasks, lost: np.ndarray, sigma0: float, r: RedundancyBlocks, sizes: PaddedSizes, tried: set
-) -> tuple[list[Exchange], Adjustment]:
-    """Return exchanges that are not in `tried`, which is extended, and `at` with the corrected positions.
+def _name_exchanges(at: Adjustment, left: RowMasks, lost: Int[np.ndarray, "n"], sigma0: float) -> Iterator[Exchange]:
+    """Yield pairs of rejected image points of an image that intersect the other rays of each other's point."""
+    block, p = at.block, at.block.image_points
+    out = left[p.group]
+    suspected = np.flatnonzero(out | np.isin(p.point, lost))
+    pairs = []
+    for image in np.unique(p.image[suspected]):
+        in_image = suspected[p.image[suspected] == image].tolist()
+        pairs += [(a, b) for a, b in combinations(in_image, 2) if p.point[a] != p.point[b]]
+    rays_of: dict[int, list[int]] = {}
+    for row in np.flatnonzero(np.isin(p.point, p.point[suspected])).tolist():
+        rays_of.setdefault(int(p.point[row]), []).append(row)
+    rows: list[int] = []
+    which: list[int] = []
+    for k, (row, measured) in enumerate(one for a, b in pairs for one in ((a, b), (b, a))):
+        others = [other for other in rays_of[int(p.point[row])] if other != row]
+        some = [measured, *([other for other in others if not out[other]] or others)]
+        rows += some
+        which += [k] * len(some)
+    _, valid = _intersect(at, np.array(rows, int), np.array(which, int), 2 * len(pairs), sigma0)
+    used: set[int] = set()
+    for (a, b), both in zip(pairs, (valid[::2] & valid[1::2]).tolist(), strict=True):
+        # Two points with two rays each, in the same images: exchange them in one image.
+        if both and not used & {int(p.point[a]), int(p.point[b])}:
+            used |= {int(p.point[a]), int(p.point[b])}
+            names = f"{block.points[p.point[a]]} and {block.points[p.point[b]]}"
+            words = f"points {names} of image {block.images[p.image[a]]} had each other's name"
+            yield Exchange(p.group, ((a, b),), words)
 
-    Coordinates are tested first: wrong ones distort images, so names appear to be exchanged.
-    """
-    for find in (
-        lambda: coordinate_exchanges(at, left, lost, sizes),
-        lambda: name_exchanges(at, left, lost, sigma0, r),
-    ):
-        pairs, placed = find()
-        if new := [e for e in pairs if (e.group, e.rows) not in tried]:
-            tried.update((e.group, e.rows) for e in new)
-            return new, placed
-    return [], at
+
+def _coordinate_exchanges(at: Adjustment, left: RowMasks) -> Iterator[Exchange]:
+    """Yield pairs of rejected control points or stations, each of which is predicted where the other was observed."""
+    block = at.block
+    for group, observed in block.named_observations.items():
+        if not isinstance(observed, AbstractCoordinates) or len(observed.indices()) != 1:
+            continue
+        ((what, who),) = ((what, to_numpy(index)) for what, index in observed.indices())
+        value, error = to_numpy(observed.value), np.array(to_numpy(observed.physical(at.residuals[group])))
+        suspects = np.unique(who[left[group]])
+        if what == "point":
+            # Wrong coordinates may stay and reject all rays: intersect these, whatever their misclosure.
+            p = block.image_points
+            suspects = np.union1d(suspects, np.intersect1d(who, p.point[left[p.group]]))
+            rays = np.flatnonzero(np.isin(p.point, suspects))
+            which = np.searchsorted(suspects, p.point[rays])
+            places, valid = _intersect(at, rays, which, len(suspects), _ANY_MISCLOSURE)
+            for k in np.flatnonzero(np.isin(who, suspects[valid])):
+                error[k] = value[k] - places[np.searchsorted(suspects, who[k]), observed.axis[k]]
+        by_axes: dict[tuple[int, ...], list[np.ndarray]] = {}
+        for k in suspects.tolist():
+            rows = np.flatnonzero(who == k)
+            rows = rows[np.argsort(observed.axis[rows])]
+            by_axes.setdefault(tuple(observed.axis[rows].tolist()), []).append(rows)
+        for objects in map(np.array, by_axes.values()):
+            for a, b in _pairs(value[objects], (value - error)[objects]):
+                ids = [int(who[objects[k][0]]) for k in (a, b)]
+                one, other = ((block.points if what == "point" else block.images)[k] for k in ids)
+                words = (
+                    f"control points {one} and {other} had each other's coordinates, or their names are exchanged in "
+                    "all images"
+                    if what == "point"
+                    else f"images {one} and {other} had each other's station, or their image points are exchanged"
+                )
+                yield Exchange(group, tuple(zip(objects[a].tolist(), objects[b].tolist(), strict=True)), words)
 
 
-def _is_necessary(at: Adjustment, left: RowMasks, exchange: Exchange, sigma0: float) -> bool:
-    """Return True if the exchanged rows fit, and would not fit without the exchange."""
-    p, rows = at.block.image_points, np.setdiff1d(np.ravel(exchange.rows), exchange.out)
-    if left[exchange.group][rows].mean() >= 0.5:
-        return False
-    if exchange.group != p.group:
-        return True
-    block, _ = exchanged(at.block, left, exchange.undone)
-    points = np.unique(p.point[rows])
-    unexchanged = eqx.tree_at(lambda a: a.block, at, block)
-    return len(intersecting_points(unexchanged, left, points, sigma0)) < len(points)
+def _pairs(observed: Float[np.ndarray, "n axes"], predicted: Float[np.ndarray, "n axes"]) -> Iterator[tuple[int, int]]:
+    """Yield pairs, each predicted near the observation of the other and far from all others."""
+    if len(observed) < 2:
+        return
+    distance = np.abs(predicted[:, None] - observed).max(axis=2)
+    nearest, (first, second) = distance.argmin(axis=1), np.sort(distance, axis=1)[:, :2].T
+    for k, other in enumerate(nearest.tolist()):
+        if k < other and nearest[other] == k and max(first[[k, other]] / second[[k, other]]) < _NEAR:
+            yield k, other
+
+
+def _exchanged(block: Block, left: RowMasks, exchange: Exchange) -> tuple[Block, RowMasks]:
+    """Exchange the observations of these rows, and reinstate them."""
+    rows = block.named_observations[exchange.group]
+    order, out = np.arange(len(rows)), left[exchange.group].copy()
+    for pair in exchange.rows:
+        order[list(pair)] = pair[::-1]
+    out[np.ravel(exchange.rows)] = False
+    new, sigma = rows.with_observation(to_numpy(rows.observation)[order]), to_numpy(rows.sigmas)
+    new = new.with_sigmas_times(sigma[order] / sigma)
+    return block.with_observations({exchange.group: new}), left | {exchange.group: out}
+
+
+def _intersect(
+    at: Adjustment, rows: Int[np.ndarray, "n"], which: Int[np.ndarray, "n"], number: int, sigma0: float
+) -> tuple[Float[np.ndarray, "number 3"], Bool[np.ndarray, "number"]]:
+    """Intersect rays (m), `which` is the set of each; True for sets that meet at the distance of the block's points."""
+    block, exterior = at.block, at.unknowns.exterior
+    p, positions = block.image_points, to_numpy(exterior.position)
+    camera = np.array(block.image_camera, object)[p.image]
+    rays, sigma = np.zeros((len(p), 3)), to_numpy(p.sigma).mean(axis=1)
+    for name, interior in at.unknowns.interior.items():
+        of_camera = camera == name
+        rays[of_camera] = camera_rays(interior, to_numpy(p.xy)[of_camera])
+        sigma[of_camera] /= float(interior.c)
+    origins, directions = positions[p.image], turn_to_object(to_numpy(exterior.camera_from_object), p.image, rays)
+    nearest, farthest = np.quantile(
+        np.linalg.norm(to_numpy(at.unknowns.points)[p.point] - origins, axis=1), [0.01, 0.99]
+    )
+    origins, directions = origins[rows], directions[rows]
+    places, valid = intersect_points(origins, directions, which, number)
+    towards = places[which] - origins
+    far = np.sum(towards * directions, axis=1)
+    square = np.sum((towards - far[:, None] * directions) ** 2, axis=1) / (far * sigma[rows]) ** 2
+    square[~((far > nearest / _DEPTH) & (far < farthest * _DEPTH))] = np.inf
+    limit = sigma0**2 * float(chi_square_limit(np.array(1), LEVEL / len(p)))
+    freedom = 2 * np.bincount(which, minlength=number) - 3
+    return places, valid & (np.bincount(which, square, number) <= limit * freedom)
 
 
 def _next_rejections(
@@ -382,3 +484,51 @@ def predicted_redundancy(at: Adjustment, left: RowMasks, sizes: PaddedSizes) -> 
             r[name] = r[name].copy()
             r[name][out] = (vectors * values[:, None]) @ np.swapaxes(vectors, 1, 2)
     return r
+
+
+# Minimum ratio of the variance to the variance without the contradicting observations (key), by the maximum fraction of
+# these (value). Normal errors with too small a stated sigma do not reach it: the ratio is 1.6 without the largest
+# tenth, 3.4 without the largest third.
+_INFLATION = {4.0: 0.1, 10.0: 1 / 3}
+
+
+class InflatedComponent(NamedTuple):
+    """Variance component inflated by a few observations."""
+
+    label: str
+    factor: float
+    without: float
+    """Variance factor without these observations."""
+    words: tuple[str, ...]
+    """Labels of the observations, worst first."""
+
+
+def inflated_components(
+    adjusted: Adjustment, components: VarianceComponents, partition: Partition, *, max_steps: int = MAX_STEPS
+) -> tuple[InflatedComponent, ...]:
+    """Return the components of `adjusted` (weights as stated) that a few blunders inflate.
+
+    A control height with an error of 70 standard deviations raises the component of thirteen heights to 270; no
+    observation is then significant. Blunders are detected by `snoop`, and the components re-estimated without them.
+    """
+    raised = [k for k, factor in enumerate(components.factor) if components.supported[k] and factor > min(_INFLATION)]
+    if not raised or not blunder_test(adjusted, redundancy_numbers(adjusted, covariance(adjusted, rows=True))).suspects:
+        return ()
+    try:
+        snooped = snoop(adjusted.block, adjusted.unknowns, max_steps=max_steps)
+        clean = variance_components(snooped.adjusted, partition, max_steps=max_steps)
+    except JaxphotoError:
+        # Most observations are inconsistent in this case.
+        return ()
+    without = dict(zip(clean.labels, clean.factor.tolist(), strict=True))
+    parts = partition_observations(adjusted, partition).part_of
+    out = [(s.words, np.atleast_2d(parts[s.group])[:, s.row]) for s in snooped.left_out]
+    out += [(e.words, np.atleast_2d(parts[e.group])[:, np.ravel(e.rows)]) for e in snooped.exchanged]
+    inflated = []
+    for k in raised:
+        label, factor = components.labels[k], float(components.factor[k])
+        number, words = sum(int((part == k).sum()) for _, part in out), tuple(w for w, part in out if (part == k).any())
+        less = factor / without.get(label, factor)
+        if any(less > t and 0 < number <= max(1.0, n * components.observations[k]) for t, n in _INFLATION.items()):
+            inflated.append(InflatedComponent(label, factor, without[label], words))
+    return tuple(inflated)

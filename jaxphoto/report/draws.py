@@ -25,8 +25,6 @@ from jaxphoto.writing import whole_file
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
-    from jaxphoto.sensitivity.posterior import Posterior
-
 LONG = ("exterior.", "point.", "check.", f"{TrajectoryKnot.kind}.")
 """Column prefixes of images, points and trajectory knots; these quantities are written to files only."""
 EXTERIOR = ("X_m", "Y_m", "Z_m", "omega_rad", "phi_rad", "kappa_rad")
@@ -178,37 +176,3 @@ def write_draws_page(
     text = page(f"Monte Carlo: {summary.get('title') or 'block'}", [*parts, *provenance(record)], (verdict, ""))
     with whole_file(directory / "report.html") as work:
         work.write_text(text, encoding="utf-8")
-
-
-_ANGLES = ("omega", "phi", "kappa")
-_NORMAL_97_5 = 1.959964
-
-
-def posterior_table(posterior: Posterior) -> pd.DataFrame:
-    """Tabulate the least-squares estimate and the posterior of each parameter, both with the a priori variance factor.
-
-    Columns: parameter, optimum, laplace_sigma, laplace_2.5_percent, laplace_97.5_percent, posterior_mean,
-    posterior_sigma, posterior_2.5_percent, posterior_97.5_percent, skewness, rhat, ess. Units are part of the parameter
-    names; angles in degrees.
-    """
-    names, factor = _names_and_factors(posterior)
-    optimum, sigma = posterior.optimum * factor, np.sqrt(np.diagonal(posterior.laplace)) * factor
-    low, high = np.quantile(posterior.draws, [0.025, 0.975], axis=0) * factor
-    return pd.DataFrame(
-        {
-            "parameter": names, "optimum": optimum, "laplace_sigma": sigma,
-            "laplace_2.5_percent": optimum - _NORMAL_97_5 * sigma,
-            "laplace_97.5_percent": optimum + _NORMAL_97_5 * sigma, "posterior_mean": posterior.mean * factor,
-            "posterior_sigma": np.sqrt(np.diagonal(posterior.covariance)) * factor, "posterior_2.5_percent": low,
-            "posterior_97.5_percent": high, "skewness": posterior.skewness, "rhat": posterior.rhat,
-            "ess": posterior.ess,
-        }
-    )  # fmt: skip
-
-
-def _names_and_factors(posterior: Posterior) -> tuple[list[str], np.ndarray]:
-    """Return the names with units, and the factors to these units."""
-    last = [parameter.rsplit(".", 1)[-1] for parameter in posterior.parameters]
-    units = ["_deg" if name in _ANGLES else "_m" if name in AXES else "" for name in last]
-    names = [parameter + unit for parameter, unit in zip(posterior.parameters, units, strict=True)]
-    return names, np.where([unit == "_deg" for unit in units], np.rad2deg(1.0), 1.0)

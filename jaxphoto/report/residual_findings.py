@@ -15,8 +15,7 @@ from jaxphoto.camera import get_parameter, parameter_names
 from jaxphoto.errors import camera_words, few
 from jaxphoto.observations import PRIORS, Correlated
 from jaxphoto.procedures.adjust import ABSURD
-from jaxphoto.procedures.blunder_causes import InflatedComponent, coordinate_mistakes, is_mirrored
-from jaxphoto.procedures.snooping import SEVERAL, Snooped, mostly_rejected, rejected_images
+from jaxphoto.procedures.snooping import SEVERAL, InflatedComponent, Snooped, mostly_rejected, rejected_images
 from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words, symbol
 from jaxphoto.report.formatting import in_file_unit
 from jaxphoto.report.tables import Tables
@@ -336,15 +335,12 @@ def _common(snooped: Snooped, block: Block) -> Iterator[Finding]:
 def _too_many(snooped: Snooped, block: Block) -> Iterator[Finding]:
     """Find images and groups with too many rejections for isolated errors."""
     most = rejected_images(snooped, block)
-    mirrored = "They fit mirrored: x and y are exchanged, or one has the wrong sign"
-    fits = {k: is_mirrored(snooped, block, k) for k in most}
-    for hint, which in ((mirrored, True), ("", False)):
-        if images := [f"{block.images[k]} ({n} of {of})" for k, (n, of) in most.items() if fits[k] is which]:
-            yield Finding("rejected_images", "error", few(images), len(images), hint=hint)
-    mistakes = coordinate_mistakes(snooped, block)
+    if images := [f"{block.images[k]} ({n} of {total})" for k, (n, total) in most.items()]:
+        hint = "Check its point names, signs, axes, camera and station, or remove it"
+        yield Finding("rejected_images", "error", few(images), len(images), hint=hint)
     for name, counts in mostly_rejected(snooped, block).items():
         many = ", ".join(f"{n} of {of} in {axis}" for axis, (n, of) in counts.items())
-        hint = f"They fit if {mistakes[name]}: correct them at their source" if name in mistakes else ""
+        hint = "Check their units, axes, names and signs, and the fixed values"
         yield Finding("rejected_group", "error", f"{name.replace('_', ' ')}, {many}", hint=hint)
 
 

@@ -8,7 +8,9 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto.adjustment import POOR, Adjustment, weaknesses_of, yardsticks
+from jaxphoto.adjustment import Adjustment
+from jaxphoto.adjustment.weak_directions import POOR, yardsticks
+from jaxphoto.adjustment.weakness_messages import weaknesses_of
 from jaxphoto.camera import RollingShutter, Sensor, ThermalRates, get_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few

@@ -38,7 +38,7 @@ from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
 from jaxphoto.devices import AXIS, mesh_of, usable
 from jaxphoto.errors import InputError, JaxphotoError
-from jaxphoto.initial import approximate
+from jaxphoto.initial.approximate import approximate
 from jaxphoto.statistics.covariance import EOP_NAMES, Rotations, physical_covariance
 from jaxphoto.unknowns import Unknowns
 

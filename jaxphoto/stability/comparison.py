@@ -1,21 +1,12 @@
-"""Comparison of calibrations: uncertainty of RMSE_offset, stability analysis, change detection, combination.
+"""Comparison of calibrations: uncertainty of RMSE_offset, stability analysis, change detection.
 
 Uncertainty. The offsets are v = v0 + J e with the errors e of both parameter sets, e ~ N(0, Q), and the exact Jacobian
 J (`BundleOffsets.jacobian`). RMSE_offset is a norm: for nearly equal bundles it is not normally distributed, and
 first-order propagation is invalid. v'v is therefore evaluated as a quadratic form in normal variables
 (`QuadraticForm`): about the estimated offsets (v0 = v) for the uncertainty, about zero (v0 = 0) for the hypothesis of
 one camera.
-
-Combination. With the parameters x_i and covariances Q_i of n independent calibrations
-
-    Q = (sum Q_i^-1)^-1,   x = Q sum Q_i^-1 x_i,   T = sum (x_i - x)' Q_i^-1 (x_i - x)
-
-and T has the chi-square distribution with (n - 1) p degrees of freedom if all are from one camera. An inconsistent
-calibration is identified by its difference d from the combination of all others, with the covariance Q_i + Q_others: d'
-(Q_i + Q_others)^-1 d has the chi-square distribution with p degrees of freedom.
 """
 
-from collections.abc import Sequence
 from typing import NamedTuple
 
 import numpy as np
@@ -41,7 +32,6 @@ from jaxphoto.stability.bundles import (
     bundle_offsets,
     check_rays,
     parameter_vector,
-    with_parameters,
 )
 from jaxphoto.stability.quadratic_form import QuadraticForm
 
@@ -307,90 +297,3 @@ def _parameters(
         values = float(a), float(b), float(b - a), float(s), p_value
         changes.append(ParameterChange(name, *values, parameter_unit(first, name)))
     return tuple(changes)
-
-
-@pretty_repr
-class Combination(NamedTuple):
-    """Weighted mean of several calibrations."""
-
-    interior: InteriorOrientation
-    covariance: Float[np.ndarray, "p p"]
-    """Covariance in the order of `parameter_names`; zero rows for fixed parameters."""
-    chi_square: float
-    degrees_of_freedom: int
-    p_value: float
-    """Probability of a larger chi-square if all calibrations are from one camera."""
-    against_others: tuple[float, ...]
-    """p-value of the difference of each calibration from the combination of all others."""
-
-    def disagreeing(self, level: float) -> list[int]:
-        """Return indices of calibrations that differ from the others, at the overall significance level `level`."""
-        n = len(self.against_others)
-        return [k for k, p in enumerate(self.against_others) if p < level / n]
-
-
-def combine(
-    interiors: Sequence[InteriorOrientation], covariances: Sequence[Float[np.ndarray, "p p"]], names: Sequence[str]
-) -> Combination:
-    """Combine independent calibrations; `names` are their labels in messages.
-
-    `covariances` are in the order of `parameter_names`, with zero rows for fixed parameters. Raises InputError for
-    fewer than two calibrations, a repeated calibration, different models, and different sets or values of fixed
-    parameters.
-    """
-    if len(interiors) < 2:
-        raise InputError("a combination needs at least two calibrations: name another one")
-    parameters = parameter_names(interiors[0])
-    free = np.diagonal(covariances[0]) > 0
-    for interior, covariance, name in zip(interiors[1:], covariances[1:], names[1:], strict=True):
-        if not same_model(interiors[0], interior):
-            raise InputError(f"{name} and {names[0]} have different camera models: combine calibrations of one model")
-        for parameter, free_first, free_here in zip(parameters, free, np.diagonal(covariance) > 0, strict=True):
-            if free_first != free_here:
-                fixed, estimated = (names[0], name) if free_here else (name, names[0])
-                raise InputError(
-                    f"{parameter} is fixed in {fixed} and estimated in {estimated}: readjust one of them to match"
-                )
-            values = [float(get_parameter(i, parameter)) for i in (interiors[0], interior)]
-            if not free_first and values[0] != values[1]:
-                raise InputError(
-                    f"{parameter} is fixed at {values[0]:g} in {names[0]} and at {values[1]:g} in {name}; readjust "
-                    "one of them to match"
-                )
-        if np.array_equal(covariance, covariances[0]) and all(
-            float(get_parameter(interior, p)) == float(get_parameter(interiors[0], p)) for p in parameters
-        ):
-            raise InputError(f"{name} and {names[0]} are the same calibration: name it once")
-    index = np.ix_(free, free)
-    vectors = np.array([[float(get_parameter(interior, name)) for name in parameters] for interior in interiors])
-    x = vectors[:, free]
-    q = np.stack([np.asarray(covariance)[index] for covariance in covariances])
-    mean, combined = _mean(x, q)
-    tests = [mahalanobis(x_i - mean, q_i) for x_i, q_i in zip(x, q, strict=True)]
-    chi_square, freedom = sum(test[0] for test in tests), sum(test[1] for test in tests[1:])
-    against = []
-    for k in range(len(x)):
-        others, q_others = _mean(np.delete(x, k, axis=0), np.delete(q, k, axis=0))
-        square, n = mahalanobis(x[k] - others, q[k] + q_others)
-        against.append(float(scipy.special.chdtrc(n, square)))
-    vector = vectors[0].copy()
-    vector[free] = mean
-    covariance = np.zeros((len(parameters), len(parameters)))
-    covariance[index] = combined
-    return Combination(
-        with_parameters(interiors[0], vector),  # type: ignore[arg-type]
-        covariance,
-        chi_square,
-        freedom,
-        float(scipy.special.chdtrc(freedom, chi_square)),
-        tuple(against),
-    )
-
-
-def _mean(x: Float[np.ndarray, "n p"], q: Float[np.ndarray, "n p p"]) -> tuple[np.ndarray, np.ndarray]:
-    """Compute the weighted mean and its covariance, in units of standard deviations."""
-    unit = np.sqrt(np.diagonal(q[0]))
-    weights = np.linalg.inv(q / unit[:, None] / unit)
-    combined = np.linalg.inv(weights.sum(axis=0))
-    mean = combined @ np.einsum("npq,nq->p", weights, (x - x[0]) / unit)
-    return x[0] + unit * mean, unit[:, None] * (combined + combined.T) / 2 * unit

@@ -10,13 +10,14 @@ from jax.flatten_util import ravel_pytree
 from scipy.optimize import minimize_scalar
 
 from jaxphoto import Outcome, adjust
-from jaxphoto.adjustment import common_sizes, weaknesses_of
+from jaxphoto.adjustment import common_sizes
 from jaxphoto.adjustment.adjust import build_problem
 from jaxphoto.adjustment.iteration_log import step_lines
 from jaxphoto.adjustment.model.numbers import state_at
 from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import typical_scale
 from jaxphoto.adjustment.solver.reduced import linearise_rows, reduce_normal
+from jaxphoto.adjustment.weakness_messages import weaknesses_of
 from jaxphoto.report.results import convergence_words
 from jaxphoto.report.tables import convergence_table
 from tests.adjustment.dense import in_one_list

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import RankError, adjust
-from jaxphoto.adjustment import POOR, weak_directions, yardsticks
+from jaxphoto.adjustment.weak_directions import POOR, weak_directions, yardsticks
 from tests.adjustment.dense import at_optimum
 from tests.blocks import adjusted, covariance_of, simulated
 from tests.marks import slow_but

@@ -8,7 +8,7 @@ from jaxphoto.block import Motion
 from jaxphoto.camera import Brown, InteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.georeferencing import Exposure, Mount, StripBias, recorded_attitude, sensor_position
-from jaxphoto.initial import approximate
+from jaxphoto.initial.approximate import approximate
 from jaxphoto.initial.resection import resect_ideal
 from jaxphoto.observations import Attitudes, ImagePoints
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix

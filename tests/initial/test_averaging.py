@@ -5,8 +5,8 @@ import pytest
 from scipy.spatial.transform import Rotation
 from scipy.stats import kstest
 
-from jaxphoto.initial import average_rotation, intersect_with_covariance
-from jaxphoto.initial.quaternions import rotated
+from jaxphoto.initial.intersection import intersect_with_covariance
+from jaxphoto.initial.quaternions import average_rotation, rotated
 from jaxphoto.rotation import small_rotation
 from tests.formulas import random_rotations, turns
 from tests.initial.image_pairs import normalised, rays_of

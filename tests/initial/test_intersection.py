@@ -1,7 +1,7 @@
 import numpy as np
 
 from jaxphoto.collinearity import intersect
-from jaxphoto.initial import intersect_points
+from jaxphoto.initial.intersection import intersect_points
 from tests.derivatives import compiled
 
 

@@ -8,7 +8,8 @@ from scipy.stats import kstest
 
 from jaxphoto.camera import Brown, InteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.initial import resect, resect_by_quaternions
+from jaxphoto.initial.quaternion_resection import resect_by_quaternions
+from jaxphoto.initial.resection import resect
 from tests.checked_types import unchecked
 from tests.formulas import random_rotations, turns
 from tests.initial.image_pairs import normalised, rotation_error

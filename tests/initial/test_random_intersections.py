@@ -3,7 +3,7 @@
 import numpy as np
 from scipy.stats import kstest
 
-from jaxphoto.initial import intersect_with_covariance
+from jaxphoto.initial.intersection import intersect_with_covariance
 from tests.initial.image_pairs import normalised, rays_of
 from tests.initial.random_scenes import intersections
 

@@ -8,7 +8,8 @@ from scipy.stats import kstest
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.initial import resect, resect_by_quaternions
+from jaxphoto.initial.quaternion_resection import resect_by_quaternions
+from jaxphoto.initial.resection import resect
 from tests.formulas import camera_from_object
 from tests.initial.image_pairs import normalised, rotation_error
 from tests.initial.random_scenes import SIGMA_MM, image_scene

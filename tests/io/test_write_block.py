@@ -139,7 +139,7 @@ def test_foreign_files_are_never_replaced(write_folder, tmp_path):
         write_block(block, tmp_path / "changed")
     write_block(dataclasses.replace(block, distances=type(block.distances).none()), tmp_path / "added")
     (tmp_path / "added" / "distances.csv").write_bytes((own / "distances.csv").read_bytes())
-    with pytest.raises(InputError, match=r"distances\.csv was not written by jaxphoto and would be read"):
+    with pytest.raises(InputError, match=r"distances\.csv was not written by jaxphoto and would be lost"):
         write_block(block, tmp_path / "added")
 
 

@@ -175,33 +175,6 @@ def test_exchanged_coordinates_are_corrected(group, one, other):
     assert float(found.adjusted.sigma0) == pytest.approx(float(adjusted_example().sigma0), rel=1e-6)
 
 
-@pytest.mark.parametrize(
-    ("group", "names", "gone"),
-    [
-        ("control_points", ("T3", "T10", "T1"), ()),
-        # Off by a row, and the last one's row there twice.
-        ("stations", tuple(f"B{k}" for k in range(1, 9)), ("B1",)),
-    ],
-)  # fmt: skip
-def test_rows_in_another_order_are_corrected(group, names, gone):
-    block = example()
-    rows = block.named_observations[group]
-    known = block.points if group == "control_points" else block.images
-    own = [np.flatnonzero(rows.who == known.index(name)) for name in names]
-    value = np.array(rows.value)
-    for here, there in itertools.pairwise([*own, own[-1] if gone else own[0]]):
-        value[here] = np.asarray(rows.value)[there]
-    found = snoop(block.with_observations({group: dataclasses.replace(rows, value=value)}))
-    (exchange,) = found.exchanged
-    assert (exchange.group == group and f"'s at {names[-2]}" in exchange.words) or len(names) > 4
-    assert ("the rows are off by one" in exchange.words) == (group == "stations")
-    assert {(s.group, s.row) for s in found.left_out} == {
-        (group, int(row)) for name in gone for row in own[names.index(name)]
-    }
-    kept = adjusted_example().unknowns.interior["kodak"]
-    np.testing.assert_allclose(found.adjusted.unknowns.interior["kodak"].c, kept.c, atol=1e-3 if gone else 1e-9)
-
-
 def test_coordinates_that_are_wrong_are_not_taken_for_an_exchange(block):
     """One control point has the coordinates of another, which are its own as well."""
     control = block.control

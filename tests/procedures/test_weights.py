@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import adjust, variance_components
-from jaxphoto.procedures.blunder_causes import inflated_components
+from jaxphoto.procedures.snooping import inflated_components
 from jaxphoto.report import component_findings
 from tests.blocks import adjusted_example, example
 

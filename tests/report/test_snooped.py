@@ -8,7 +8,6 @@ import pytest
 from jaxphoto import snoop
 from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.observations import Distances
-from jaxphoto.procedures.blunder_causes import coordinate_mistakes
 from jaxphoto.procedures.snooping import Snooped
 from jaxphoto.report import Tables, verdict_of
 from jaxphoto.report.residual_findings import snooped_findings
@@ -66,7 +65,6 @@ def mirrored(block, name):
 def assert_mirrored(snooped, block, name):
     first = snooped_findings(snooped, block)[0]
     assert (first.code, first.severity) == ("rejected_images", "error") and first.subject.startswith(name)
-    assert "mirrored" in first.hint
 
 
 def test_a_mostly_rejected_image_is_an_error():
@@ -112,7 +110,7 @@ def test_a_file_in_wrong_units_is_rejected_with_its_cause(block):
     found = snoop(spoilt)
     assert {(s.group, int(rows.axis[s.row])) for s in found.left_out} == {(rows.group, 2)} and not found.points
     first = snooped_findings(found, spoilt)[0]
-    assert first.severity == "error" and "Z is in feet, not in metres" in first.hint
+    assert (first.code, first.severity) == ("rejected_group", "error")
     # Each is predicted by what is in, and not by others that are out: as well as the others place the point.
     adjusted = found.adjusted
     height, sigma0 = np.asarray(adjusted.unknowns.points)[:, 2], float(adjusted.sigma0)
@@ -121,29 +119,3 @@ def test_a_file_in_wrong_units_is_rejected_with_its_cause(block):
         who = rows.who[s.row]
         assert s.error == pytest.approx(value[s.row] - height[who], abs=1e-4)
         assert s.sigma == pytest.approx(sigma0 * np.sqrt(rows.sigma[s.row] ** 2 + variance[who]), rel=1e-3)
-
-
-@pytest.mark.parametrize(
-    ("mistake", "said"),
-    [
-        (lambda xyz: xyz[:, [1, 0, 2]], "X and Y are exchanged"),
-        (lambda xyz: xyz[:, [2, 0, 1]], "X and Y and Z are exchanged"),
-        (lambda xyz: xyz * [1, -1, 1], "Y is of the other sign"),
-        (lambda xyz: xyz * 1000, "X and Y and Z are in millimetres, not in metres"),
-        (lambda xyz: xyz * [0.3048, 0.3048, 1], "X and Y are converted from feet, but were metres"),
-        (lambda xyz: xyz + np.random.default_rng(2).normal(0, 50, xyz.shape), None),
-        (lambda xyz: xyz + np.array([0, 0, 48]), None),
-    ],
-)
-def test_mistakes_of_a_file_are_distinguished_from_other_errors(block, mistake, said):
-    rows = block.stations
-    xyz = np.asarray(rows.value).reshape(-1, 3)
-    given = block.with_observations({"stations": dataclasses.replace(rows, value=mistake(xyz).ravel())})
-    error = (
-        np.asarray(given.stations.value) - np.asarray(rows.value) + np.random.default_rng(1).normal(0, 0.3, len(rows))
-    )
-    left = [
-        Suspect("stations", int(k), 0, "", float(error[k]) / 0.3, float(error[k]), 0.3, "m")
-        for k in np.flatnonzero(np.abs(error) > 2.0)
-    ]
-    assert coordinate_mistakes(Snooped(None, tuple(left), (), ()), given).get("stations") == said

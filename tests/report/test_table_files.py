@@ -120,8 +120,6 @@ def test_markdown_is_a_table_of_as_many_cells():
     assert len(x.partition(".")[2]) == len(sigma.partition(".")[2])
 
 
-
-
 def test_a_table_that_there_is_not_is_named():
     with pytest.raises(InputError, match="unknown table inner; use one of interior, exterior"):
         write_tables(Tables(adjusted("cross")), "nowhere", names=["inner"])

@@ -11,7 +11,6 @@ from jaxphoto.extras.formats.convert import (
     EXPORTS,
     FORMATS,
     LOSS_PX,
-    check_export_target,
     convert,
     export,
     read_control,
@@ -24,6 +23,6 @@ from jaxphoto.extras.formats.project import ControlPoints, Project, ProjectCamer
 
 __all__ = [
     "CAMERAS_WRITTEN", "CAMERA_FORMATS", "CONTROL_FORMATS", "EXPORTS", "FORMATS", "LOSS_PX",
-    "ControlPoints", "Project", "ProjectCamera", "check_export_target", "convert", "export", "read_control",
+    "ControlPoints", "Project", "ProjectCamera", "convert", "export", "read_control",
     "read_source", "read_tables", "recognise", "write_camera_file",
 ]  # fmt: skip

@@ -150,7 +150,7 @@ def export(project: Project, folder: str | Path, format: str) -> Exported:
         raise InputError(f"unknown export format {format!r}; choose one of {', '.join(EXPORTS)}")
     chosen, folder = EXPORTS[format], Path(folder)
     assert chosen.write is not None
-    check_export_target(folder)
+    check_folder(folder)
     cameras = {
         name: _in_model(interior, sensor, chosen, EXPORTS, f"camera {name}")
         for name, (sensor, interior, _) in project.cameras.items()
@@ -166,14 +166,9 @@ def export(project: Project, folder: str | Path, format: str) -> Exported:
         written = written._replace(column_row=radial.on_same_rays(project, cameras))
         lengths = np.linalg.norm(written.column_row - project.column_row, axis=1)
         moved = float(np.sqrt(np.mean(lengths**2))), float(lengths.max())
-    with whole_folder(folder, lambda name: True) as work:
+    with whole_folder(folder) as work:
         chosen.write(written, work)
     return Exported(cameras, moved)
-
-
-def check_export_target(folder: Path, *inputs: Path) -> None:
-    """Raise InputError if the folder is not writable or not empty: programs would read other files in it."""
-    check_folder(folder, *inputs, clashes=lambda name: True)
 
 
 def _in_model(

@@ -1,12 +1,11 @@
 """The block folder: one TOML file and CSV tables (docs/block_folder.md)."""
 
 from jaxphoto.io.block_folder.block_reader import BlockTables, assemble, exposure_times, read_block
-from jaxphoto.io.block_folder.block_writer import check_block_target, whole_block, write_block
+from jaxphoto.io.block_folder.block_writer import whole_block, write_block
 
 __all__ = [
     "BlockTables",
     "assemble",
-    "check_block_target",
     "exposure_times",
     "read_block",
     "whole_block",

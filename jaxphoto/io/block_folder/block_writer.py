@@ -2,7 +2,7 @@
 
 import csv
 import math
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
 from typing import Any, Literal
@@ -13,7 +13,7 @@ import pandas as pd
 from jaxphoto.block import Block
 from jaxphoto.errors import BlockError
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
-from jaxphoto.io.block_folder.declared_tables import Kind, declared_tables, kinds_of, layouts
+from jaxphoto.io.block_folder.declared_tables import declared_tables, kinds_of
 from jaxphoto.io.block_folder.flight import check_motion_held
 from jaxphoto.io.block_folder.map_tables import tables_to_map
 from jaxphoto.io.block_folder.parameters import mounts_of, parameters_section, scanner_section, unknown_sections
@@ -36,12 +36,7 @@ from jaxphoto.io.toml import toml_text
 from jaxphoto.observations import OBSERVATIONS, AbstractCoordinates
 from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import FIXED, FREE
-from jaxphoto.writing import Clashes, check_folder, whole_folder
-
-
-def check_block_target(folder: Path, *inputs: Path) -> None:
-    """Raise InputError if `folder` cannot be written (`check_folder`), or contains tables of a block."""
-    check_folder(folder, *inputs, clashes=_tables_of(OBSERVATIONS))
+from jaxphoto.writing import whole_folder
 
 
 @outside_transformations
@@ -53,7 +48,7 @@ def write_block(block: Block, folder: str | Path) -> None:
     for images with an attitude. A block that jaxphoto wrote to `folder` is replaced; other files are retained
     (`whole_folder`).
 
-    Raises InputError if `folder` contains a block or file that jaxphoto did not write, or one modified since. Raises
+    Raises InputError if `folder` contains a block or file that jaxphoto did not write. Raises
     BlockError for priors that block.toml cannot represent.
     """
     with whole_block(block, folder):
@@ -64,14 +59,9 @@ def write_block(block: Block, folder: str | Path) -> None:
 def whole_block(block: Block, folder: str | Path) -> Iterator[Path]:
     """Yield a temporary folder with the files of `write_block`; the caller may add files before it becomes `folder`."""
     check_motion_held(block)
-    with whole_folder(Path(folder), _tables_of((*OBSERVATIONS, *kinds_of(block)))) as work:
+    with whole_folder(Path(folder)) as work:
         _write_files(block, work)
         yield work
-
-
-def _tables_of(kinds: Iterable[Kind]) -> Clashes:
-    """Return a predicate of file names: True for files that are read as part of a block folder."""
-    return {TOML, *(f"{name}.csv" for name in layouts(kinds))}.__contains__
 
 
 def _write_files(block: Block, folder: Path) -> None:

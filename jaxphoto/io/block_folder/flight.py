@@ -11,15 +11,14 @@ from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block, Frame, Motion
 from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import BlockError, InputError
-from jaxphoto.georeferencing import Poses, RigCamera, covered, interpolate
-from jaxphoto.georeferencing.time_scales import DAY, LEAP_SECONDS, looks_like, shift_that_fits
+from jaxphoto.georeferencing import RigCamera, covered, interpolate
+from jaxphoto.georeferencing.time_scales import looks_like
 from jaxphoto.georeferencing.trajectory import SHORTEST
-from jaxphoto.georeferencing.yaw_units import counts_in_radians
 from jaxphoto.io.block_folder.observations import Images, read_attitudes, read_stations
 from jaxphoto.io.block_folder.settings import Settings, default_sigma
 from jaxphoto.io.block_folder.table_layout import RATE, VELOCITY
 from jaxphoto.io.text_tables import Table
-from jaxphoto.io.trajectory import Records, positions_in, trajectory_in
+from jaxphoto.io.trajectory import Records, trajectory_in
 from jaxphoto.observations import Attitudes, CameraPositions, RelativeAttitudes, RelativePositions, RigPlaces, RigTurns
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from jaxphoto.unknowns import FIXED, Unknowns, late_cameras
@@ -154,30 +153,6 @@ def _late_pairs(rows: Iterable[Any], cameras: Sequence[str], late: Collection[st
                     yield reference, cameras[image]
 
 
-def check_attitude_units(table: Table, stations: CameraPositions, images: Images) -> None:
-    """Check the unit of attitudes.csv by the direction of flight between consecutive images (`_check_yaw`)."""
-    yaw = np.full(len(images.ids), np.nan)
-    yaw[images.find(table)] = table.numbers("yaw_deg")
-    position = np.where(images.known[:, None], np.asarray(images.exterior.position), np.nan)
-    position[stations.who, stations.axis] = stations.value
-    strips = np.unique(np.array(images.strips, object).astype(str), return_inverse=True)[1]
-    order = np.lexsort((np.arange(len(strips)), images.times, strips))
-    same = strips[order[1:]] == strips[order[:-1]]
-    first, second = order[:-1][same], order[1:][same]
-    _check_yaw(yaw[first], position[second] - position[first], table.file)
-
-
-def _check_yaw(yaw: np.ndarray, flown: np.ndarray, file: str) -> None:
-    """Raise InputError if `yaw` agrees with the direction of flight `flown` in radians but not in degrees."""
-    course = np.arctan2(flown[:, 0], flown[:, 1])
-    known = ~np.isnan(course) & ~np.isnan(yaw)
-    if counts_in_radians(yaw[known], course[known]):
-        raise InputError(
-            f"{file}: the yaw angles are between {yaw[known].min():.2f} and {yaw[known].max():.2f} and follow the "
-            "direction of flight as radians, not as degrees; convert roll, pitch and yaw to degrees"
-        )
-
-
 def _interpolated(records: Records, images: Images, frame: Frame, settings: Settings) -> ObservedFlight:
     """Interpolate stations, attitudes and motion of the images at `time_s` + `shift_s`.
 
@@ -202,8 +177,13 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
                 f"columns such as sigma_{column}"
             )
     trajectory = trajectory_in(near, frame, sigmas[0], np.deg2rad(sigmas[1]))
-    _check_yaw(near.roll_pitch_yaw_deg[:-1, 2], np.diff(np.asarray(trajectory.position), axis=0), records.file)
-    _check_inside(times, image, records, images, shift)
+    for k in np.flatnonzero((times < records.time[0]) | (times > records.time[-1]))[:1]:
+        raise images.table.misfit(
+            image[k],
+            f"image {images.ids[image[k]]} is exposed outside {records.file}: exposures at {looks_like(times)}, "
+            f"trajectory at {looks_like(records.time)}; correct time_s or leave it empty, use a trajectory that covers "
+            "it, or give the shift between the two clocks as shift_s under [trajectory]",
+        )
     for k in np.flatnonzero(~np.asarray(covered(trajectory, jnp.asarray(times), max_gap)))[:1]:
         i = np.clip(np.searchsorted(records.time, times[k], side="right") - 1, 0, len(records.time) - 2)
         raise images.table.misfit(
@@ -213,7 +193,6 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
             "max_gap_s under [trajectory]",
         )
     poses = jax.tree.map(np.asarray, _interpolate(trajectory, jnp.asarray(times), max_gap))
-    _check_leap_seconds(poses, times, image, records, images, frame, shift)
     velocity, rate = np.zeros((len(images.ids), 3)), np.zeros((len(images.ids), 3))
     velocity[image], rate[image] = poses.velocity, poses.rate
     who, axis = np.repeat(image, 3), np.tile(np.arange(3), len(image))
@@ -231,64 +210,6 @@ def _near(records: Records, times: np.ndarray) -> Records:
     change = np.zeros(n + 1, int)
     np.add.at(change, np.clip(at - _MARGIN, 0, n - SHORTEST), 1)
     np.add.at(change, np.clip(at + _MARGIN, SHORTEST, n), -1)
-    return _taken(records, np.cumsum(change[:-1]) > 0)
-
-
-def _taken(records: Records, chosen: np.ndarray) -> Records:
-    return records._replace(**{n: v[chosen] for n, v in records._asdict().items() if isinstance(v, np.ndarray)})
-
-
-def _check_inside(times: np.ndarray, image: np.ndarray, records: Records, images: Images, shift: float) -> None:
-    """Raise BlockError for an exposure outside the trajectory; report the clock shift if one explains it."""
-    start, end = float(records.time[0]), float(records.time[-1])
-    outside = np.flatnonzero((times < start) | (times > end))
-    if not len(outside):
-        return
-    first, missing = image[outside[0]], shift_that_fits(times, start, end)
-    if missing is not None:
-        cure = f"write shift_s = {missing + shift:.15g} under [trajectory] to bring all exposures into it"
-        if missing % DAY == 0:
-            cure += f" (and {LEAP_SECONDS[0]} s more if time_s is UTC)"
-    elif times.min() < 600 and len(outside) == len(times):
-        cure = (
-            "give GPS times in images.csv, or the time of the first exposure on the clock of the trajectory as "
-            "shift_s under [trajectory]"
-        )
-    else:
-        cure = "use a trajectory that covers it, correct time_s, or leave time_s empty"
-    raise images.table.misfit(
-        first,
-        f"image {images.ids[first]} is exposed outside {records.file}: exposures at {looks_like(times)}, "
-        f"trajectory at {looks_like(records.time)}; {cure}",
-    )
-
-
-def _check_leap_seconds(
-    poses: Poses, times: np.ndarray, image: np.ndarray, records: Records, images: Images, frame: Frame, shift: float
-) -> None:
-    """Raise BlockError if approximate positions fit the trajectory only after a shift by leap seconds."""
-    known = images.known[image]
-    if not known.any():
-        return
-    expected = np.asarray(images.exterior.position)[image[known]]
-
-    def distance(leap: float) -> float:
-        """Return the median distance to the trajectory at shifted times, limited to its first and last record."""
-        last = np.clip(np.searchsorted(records.time, times[known] + leap), 1, len(records.time) - 1)
-        before, after = (positions_in(_taken(records, k), frame) for k in (last - 1, last))
-        span = records.time[last] - records.time[last - 1]
-        part = np.clip((times[known] + leap - records.time[last - 1]) / span, 0.0, 1.0)[:, None]
-        return float(np.median(np.linalg.norm((1 - part) * before + part * after - expected, axis=1)))
-
-    now, speed = distance(0.0), float(np.median(np.linalg.norm(poses.velocity, axis=1)))
-    # Below half of the smallest leap-second shift, approximate positions cannot distinguish the time scales.
-    if now <= 0.5 * min(LEAP_SECONDS) * speed:
-        return
-    distances = {sign * leap: distance(sign * leap) for leap in LEAP_SECONDS for sign in (1, -1)}
-    best = min(distances, key=lambda leap: distances[leap])
-    if distances[best] < 0.1 * now:
-        raise BlockError(
-            f"{images.table.file}: the approximate positions are {now:.0f} m from {records.file} at time_s, but "
-            f"{distances[best]:.0f} m at {best:+d} s, so one clock is UTC and the other GPS; write "
-            f"shift_s = {best + shift:.15g} under [trajectory]"
-        )
+    chosen = np.cumsum(change[:-1]) > 0
+    columns: dict[str, Any] = {n: v[chosen] for n, v in records._asdict().items() if isinstance(v, np.ndarray)}
+    return records._replace(**columns)

@@ -18,8 +18,9 @@ from jaxphoto.camera import InteriorOrientation, Sensor, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation, project
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError
-from jaxphoto.initial import resect, resect_by_quaternions
+from jaxphoto.initial.quaternion_resection import resect_by_quaternions
 from jaxphoto.initial.rays import padded_length
+from jaxphoto.initial.resection import resect
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.unknowns import FREE, Unknowns, default_priors
 
