@@ -6,7 +6,7 @@ from functools import partial
 from itertools import count
 from pathlib import Path
 from threading import Thread
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, get_args
 
 import typer
 from typer import Argument, Option
@@ -48,7 +48,6 @@ def fly(
     control: Annotated[Path | None, Option(help=f"Surveyed points: {_CONTROL}.")] = None,
     marks: opt.ControlMarks = None,
     control_epsg: opt.ControlSystem = None,
-    targets: opt.Targets = None,
 ) -> None:
     """Calibrate the camera of a flight from its photographs and their positions: orient, georeference, adjust, assess.
 
@@ -59,11 +58,9 @@ def fly(
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.errors import counted
     from jaxphoto.extras.formats import read_control
-    from jaxphoto.extras.photos.control_targets import make_target_search
     from jaxphoto.extras.photos.features import LONGEST_PX
     from jaxphoto.extras.photos.matching import match_photographs
     from jaxphoto.extras.photos.photograph_pairs import MostSimilar, photograph_pairs, usual_choice, usual_count
-    from jaxphoto.extras.photos.targets.on_ground import read_target
     from jaxphoto.georeferencing.map_frame import check_heights
     from jaxphoto.georeferencing.recorded_positions import WGS84
     from jaxphoto.io.block_folder import whole_block
@@ -78,8 +75,7 @@ def fly(
     )
     from jaxphoto.io.result_folder import write_photograph_files
     from jaxphoto.procedures.calibration import distortion_model
-    from jaxphoto.procedures.control.of_flight import flight_control
-    from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
+    from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight, flight_control
     from jaxphoto.report import prepare_pictures
     from jaxphoto.report.flight import (
         FlightSource,
@@ -92,11 +88,11 @@ def fly(
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.certificate import Provenance, certify
 
-    if control is None and (marks or control_epsg or targets):
-        raise typer.BadParameter("--marks, --control-epsg and --targets need --control FILE.")
+    if control is None and (marks or control_epsg):
+        raise typer.BadParameter("--marks and --control-epsg need --control FILE.")
     control_files = [path for path in (control, marks) if path]
     check_folder(out, *photographs, *control_files, *(exposures or ()))
-    surveyed, target = read_control(control, marks) if control else None, read_target(targets) if targets else None
+    surveyed = read_control(control, marks) if control else None
     check_pieces(beside(out))
     code, vertical = map_codes(epsg)
     reference, arm = height_reference(heights), _lever_arm(lever_arm)
@@ -112,9 +108,8 @@ def fly(
         output.say(*positions.sentences)
         points = None
         if surveyed:
-            finder = make_target_search(target, {p.name: p.path for p in read}) if target else None
             stations = [p.name for p in read], [p.gps for p in read]
-            points, code = flight_control(surveyed, control_epsg, *stations, finder, code)
+            points, code = flight_control(surveyed, control_epsg, *stations, code)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
         choice, number = pairs or usual_choice(read), features or usual_count(len(read))
@@ -147,7 +142,6 @@ def fly(
                 None if no_lens_prior else known_lens(read, camera, distortion),
                 taken if rolling_shutter else None,
                 vertical,
-                sorted(taken, key=lambda name: taken[name][0]) if len(taken) == len(read) else (),
             ),
             progress.update,
         )
@@ -205,10 +199,6 @@ def control(
     out: opt.Out,
     marks: opt.ControlMarks = None,
     control_epsg: opt.ControlSystem = None,
-    targets: opt.Targets = None,
-    photographs: Annotated[
-        list[Path] | None, Option(help="Folder of the block's photographs, to find targets.")
-    ] = None,
     epsg: opt.MapSystem = None,
 ) -> None:
     """Adjust an oriented block with surveyed points and their image measurements.
@@ -217,13 +207,10 @@ def control(
     1: results written, but the verdict is red.
     """
     from jaxphoto.extras.formats import read_control
-    from jaxphoto.extras.photos.control_targets import make_target_search
-    from jaxphoto.extras.photos.targets.on_ground import read_target
     from jaxphoto.io import read_block
     from jaxphoto.io.block_folder import whole_block
-    from jaxphoto.io.photographs import skipped_messages, valid_photographs
     from jaxphoto.procedures.adjust import adjust
-    from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
+    from jaxphoto.procedures.control import at_optimum, control_block
     from jaxphoto.report import Tables, verdict_of
     from jaxphoto.report.control import control_findings, control_summary, write_control
     from jaxphoto.report.findings import Verdict
@@ -234,27 +221,15 @@ def control(
 
     files = [path for path in (file, marks) if path]
     check_folder(out, block, *files)
-    if (targets is None) != (not photographs):
-        raise typer.BadParameter("Give both --targets and --photographs, or neither.")
-    target, (code, vertical) = read_target(targets) if targets else None, map_codes(epsg)
+    code, vertical = map_codes(epsg)
     with output.progress("reading") as progress:
         points, read = read_control(file, marks), read_block(block)
         progress.update("adjusting the block")
         oriented = at_optimum(adjust(read))
-        valid, corrupt = valid_photographs(photographs) if photographs else ([], {})
-        paths = {p.name: p.path for p in valid}
-        provenance = Provenance.of_block(block, files, list(paths.values()))
-        options: dict[str, Any] = {
-            "system": control_epsg,
-            "code": code,
-            "vertical": vertical,
-            "report": progress.update,
-        }
-        if target:
-            finder = make_target_search(target, paths, progress.update)
-            result = control_block_with_targets(oriented, points, finder, **options)
-        else:
-            result = control_block(oriented, points, **options)
+        provenance = Provenance.of_block(block, files, [])
+        result = control_block(
+            oriented, points, system=control_epsg, code=code, vertical=vertical, report=progress.update
+        )
         progress.update("computing statistics")
         tables, adjusted = Tables(result.adjusted), result.adjusted
         verdict = Verdict.of([*verdict_of(tables).findings, *control_findings(result)])
@@ -270,8 +245,6 @@ def control(
             write_summary({**verdict.summary, **control_summary(result), "versions": versions()}, work)
             with whole_block(adjusted.block, work / "block") as folder:
                 provenance.write(images, folder)
-    for text in skipped_messages(corrupt):
-        output.warn(f"skipped in the search for targets: {text}")
     output.say(*result.sentences, verdict.headline)
     for finding in verdict.findings:
         if finding.severity != "note" or finding.code == "check_points":
@@ -476,44 +449,6 @@ def _orient_block(output: Output, folder: Path, out: Path) -> None:
     n_images, n_oriented = len(block.images), int(sum(oriented.start.image_known))
     output.wrote(out, f"{n_oriented} of {n_images} images oriented; wrote {out}")
     output.add(n_images=n_images, n_oriented=n_oriented)
-
-
-@command("undistort", PANEL, "jaxphoto undistort photographs --camera results --out straight")
-def undistort(
-    output: Output,
-    photographs: opt.Photographs,
-    camera: Annotated[Path, Option(help="Results, block, COLMAP model or camera file.")],
-    out: Annotated[Path, Option(help="Output folder for the photographs and their camera.toml.")],
-    which: opt.Camera = None,
-    keep: Annotated[
-        Literal["crop", "all"], Option(help="crop: without black borders; all: whole image with black borders.")
-    ] = "crop",
-) -> None:
-    """Resample photographs to a camera without distortion.
-
-    Exit code 1: results written, but some photographs were skipped.
-    """
-    from jaxphoto.io.camera_files import read_camera_file
-    from jaxphoto.io.photographs import skipped_messages, skipped_subfolders, valid_photographs
-    from jaxphoto.io.undistorted import write_undistorted
-    from jaxphoto.writing import check_folder
-
-    check_folder(out, camera, *photographs)
-    with output.progress("reading the photographs") as progress:
-        file = read_camera_file(camera, camera=which)
-        read, corrupt = valid_photographs(photographs)
-        written = write_undistorted(read, file, out, keep, progress=partial(progress.steps, "undistorting"))
-    skipped = corrupt | written.left_out
-    for text in (*skipped_messages(skipped), *skipped_subfolders(photographs).values()):
-        output.warn(f"skipped: {text}")
-    sensor, interior = written.camera
-    n, c_px = len(read) - len(written.left_out), float(interior.c) / sensor.pixel_mm
-    output.say(f"{n} photographs of {sensor.width_px} x {sensor.height_px} pixels, c = {c_px:.6g} pixels")
-    output.wrote(out, f"wrote {out}")
-    size = {"width_px": sensor.width_px, "height_px": sensor.height_px}
-    output.add(n_photographs=n, **size, c_px=c_px, left_out=list(skipped))
-    if skipped:
-        raise typer.Exit(1)
 
 
 def map_codes(text: str | None) -> tuple[int | None, int | None]:

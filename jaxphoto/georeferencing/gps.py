@@ -1,5 +1,6 @@
-"""Recorded GNSS positions of photographs."""
+"""Recorded GNSS positions and exposure times of photographs."""
 
+from datetime import datetime
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -27,6 +28,27 @@ Fixed: 1 cm + 1 ppm in plan and 1.5 cm + 1 ppm in height (DJI, specifications of
 of base station and interpolation. Float: decimetres (DJI, manuals: RtkFlag). Integrated: 2 to 5 cm in plan and 5 to 10
 cm in height (Applanix, specifications of APX-15 and POS AV, post-processed).
 """
+
+
+LEAP_SECONDS = 18.0
+"""GPS time minus UTC since 2017 (s)."""
+WEEK_S = 604_800.0
+
+
+def gps_seconds(at: datetime) -> float:
+    """Return the seconds since 1980-01-06 in the time zone of `at`, without leap seconds."""
+    return (at - datetime(1980, 1, 6)).total_seconds()
+
+
+class Taken(NamedTuple):
+    """Exposure time recorded in the file of a photograph."""
+
+    clock_s: float
+    """Time of the camera's clock in its time zone, in seconds since 1980-01-06."""
+    resolution_s: float
+    """Resolution of the time (s); 1 for whole seconds."""
+    ahead_of_utc_s: float | None = None
+    """Offset of the clock from UTC (s); None if unknown."""
 
 
 class Gps(NamedTuple):

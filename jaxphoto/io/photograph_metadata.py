@@ -27,8 +27,7 @@ from typing import Any, NamedTuple
 from PIL import ExifTags, Image
 
 from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, CameraAttitude, level_from_belly, level_from_gimbal
-from jaxphoto.georeferencing.exposure_times import Taken, gps_seconds
-from jaxphoto.georeferencing.gps import Fix, Gps, Heights
+from jaxphoto.georeferencing.gps import Fix, Gps, Heights, Taken, gps_seconds
 
 TAG = ExifTags.Base
 # XMP attributes or elements. Search by regular expressions: some packets are truncated or not well-formed XML.

@@ -15,8 +15,7 @@ from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Sensor
 from jaxphoto.camera.lens_prior import lens_prior
 from jaxphoto.errors import InputError, counted, few
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
-from jaxphoto.georeferencing.exposure_times import Taken
-from jaxphoto.georeferencing.gps import Gps
+from jaxphoto.georeferencing.gps import Gps, Taken
 from jaxphoto.io.photograph_metadata import (
     TAG,
     Exif,

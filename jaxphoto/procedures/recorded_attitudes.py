@@ -4,9 +4,6 @@ Each photograph gives the rotation from network to map: the product of its recor
 average determines the rotation about the line of a single strip, which positions do not determine. It contains the
 common error of all attitudes (zero of a gimbal, mounting). As observations, attitudes therefore have a boresight with a
 prior of that size.
-
-Recorded attitudes refer to the sensor and contradict pictures that software rotated in steps of 90 degrees. Positions
-reveal such rotations: with unchanged attitudes, the network would be perpendicular or opposite to its flight line.
 """
 
 import dataclasses
@@ -36,9 +33,9 @@ mounting, and declination of a compass.
 _BEYOND, _LEAST_DEG = 4.0, 5.0
 # Median deviation (degrees) above which attitudes are contradictory.
 _CONTRADICT_DEG = 15.0
-# Minimum cosine between directions in the rotated network and of positions: after a quarter turn of the pictures (20
-# degrees), without it (60 degrees).
-_SAME_LINE, _OTHER_LINE = 0.94, 0.5
+# Minimum cosine between directions in the rotated network and of positions; pictures that software rotated by 90
+# degrees contradict the attitudes of the sensor.
+_OTHER_LINE = 0.5
 # Maximum median relative error of distances for positions to determine directions; number of positions below which only
 # distant pairs are used; minimum distance of these in standard deviations.
 _TELLING, _FEW, _APART = 0.1, 6, 3.0
@@ -63,10 +60,6 @@ class RecordedRotation(NamedTuple):
     scatter_rad: float
     """RMS deviation of single attitudes from `turn`."""
     left_out: tuple[str, ...]
-    quarters: int = 0
-    """Clockwise quarter turns of the pictures relative to the attitudes in their files; already applied to
-    `local_from_camera`.
-    """
 
 
 def recorded_rotation(
@@ -92,14 +85,13 @@ def recorded_rotation(
     along = _cosine(network, local, sigma, first)
     if isinstance(first, RecordedRotation) and (along is None or along > _OTHER_LINE):
         return first
-    for quarters in (1, 2, 3):
-        rotation = _rotation_of(block, usable, attitude @ _clockwise(quarters))
-        if isinstance(rotation, RecordedRotation) and (_cosine(network, local, sigma, rotation) or 0.0) > _SAME_LINE:
-            return rotation._replace(quarters=quarters)
     if along is None:
         return first
     apart_deg = np.rad2deg(np.arccos(np.clip(along, -1, 1)))
-    return f"the attitudes of the files contradict the positions by {apart_deg:.0f} degrees: not used"
+    return (
+        f"the attitudes of the files contradict the positions by {apart_deg:.0f} degrees (pictures rotated by a "
+        "program?): not used"
+    )
 
 
 def _rotation_of(
@@ -130,11 +122,6 @@ def _rotation_of(
 def _subset(n: int) -> Int[np.ndarray, "m"]:
     """Return evenly spaced indices of at most `_MOST` photographs."""
     return np.linspace(0, n - 1, min(n, _MOST)).astype(int)
-
-
-def _clockwise(quarters: int) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation from the axes of a picture turned clockwise to the sensor axes."""
-    return np.linalg.matrix_power(np.array([[0.0, -1.0, 0.0], [1.0, 0.0, 0.0], [0.0, 0.0, 1.0]]), quarters)
 
 
 def _cosine(

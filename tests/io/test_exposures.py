@@ -7,12 +7,12 @@ from datetime import datetime, timedelta
 import numpy as np
 import pyproj
 import pytest
+from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, Taken
 from PIL import Image
 from pyproj import CRS
 
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_belly
-from jaxphoto.georeferencing.exposure_times import LEAP_SECONDS, WEEK_S, Taken
 from jaxphoto.georeferencing.gps import FIX_SIGMA_M, Gps, moved
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io.exposures import located, read_exposures, with_exposures

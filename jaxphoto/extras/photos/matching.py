@@ -23,11 +23,10 @@ from jaxphoto.compiling.freed_memory import freed_memory_kept
 from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.features import LONGEST_PX, METHOD, SiftFeatures, sift_features
 from jaxphoto.extras.photos.photograph_pairs import MostSimilar, largest_of, most_similar, usual_count
-from jaxphoto.initial.matches import PairMatches, connected_images, tracks
+from jaxphoto.initial.matches import MatchedPart, PairMatches, connected_images
 from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.io.photographs import Photograph
-from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation.colmap import MappedCamera, import_pycolmap, write_database
 
 MIN_MATCHES = 15
@@ -79,15 +78,6 @@ class MatchedPhotographs(NamedTuple):
         return MatchedPart(names, self.xy_mm, self.sigma_mm, self.pairs, self.gross, self.sigma_factor)
 
 
-class TieFeatures(NamedTuple):
-    """Tie points in several photographs, one row per measurement, sorted by point."""
-
-    photograph: Int[np.ndarray, "rows"]
-    """Index of the photograph."""
-    point: Int[np.ndarray, "rows"]
-    xy_mm: Float[np.ndarray, "rows 2"]
-
-
 def match_photographs(
     photographs: Sequence[Photograph],
     sensor: Sensor,
@@ -118,26 +108,6 @@ def match_photographs(
     blank = [len(xy) == 0 for xy in matched.xy_mm]
     alone = _alone([path.name for path in paths], blank, matched.pairs, in_parts)
     return matched._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
-
-
-def tie_features(
-    paths: list[Path], sensor: Sensor, count: int | None = None, least_photographs: int = 2
-) -> TieFeatures:
-    """Return the tie points of overlapping photographs of one camera.
-
-    All pairs are matched by `match_photographs` and joined by `tracks`; points in fewer than `least_photographs` are
-    omitted. Raises InputError as `sift_features`, and if there is no point in enough photographs.
-    """
-    each = itertools.combinations(range(len(paths)), 2)
-    matched = _matched(paths, sensor, InteriorOrientation(1.0), each, count, LONGEST_PX, None, lambda *step: None)
-    image, feature, point, _ = tracks([len(xy) for xy in matched.xy_mm], matched.pairs)
-    kept = np.bincount(point)[point] >= least_photographs
-    if not kept.any():
-        raise InputError(
-            f"the {len(paths)} photographs have no point in common; give overlapping photographs of the same size"
-        )
-    xy_mm = np.stack([matched.xy_mm[i][f] for i, f in zip(image[kept], feature[kept], strict=True)])
-    return TieFeatures(image[kept], np.unique(point[kept], return_inverse=True)[1], xy_mm)
 
 
 class _PairResult(NamedTuple):
