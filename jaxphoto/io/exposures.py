@@ -249,12 +249,12 @@ def _read_table(path: Path, code: int | None, heights: Heights) -> Exposures:
     """
     sigmas_deg = [f"sigma_{name}" for name in (*_OPK, *_RPY)]
     optional = (*_PLACE, *_MAP, *_SIGMA, *_OPK, *_RPY, *sigmas_deg, "fix")
-    table = read_csv(path, ("image",), optional, text=("fix",))
+    table = read_csv(path, (), ("image", *optional), text=("fix",))
     columns = next((names for names in (_PLACE, _MAP) if all(name in table for name in names)), None)
-    if columns is None:
+    if columns is None or "image" not in table:
         raise InputError(
-            f"{table.file}: no positions; give the columns {', '.join(_PLACE)} (WGS 84), or {', '.join(_MAP)} with "
-            f"--epsg; optional columns: {', '.join((*_SIGMA, *_OPK, *_RPY, *sigmas_deg, 'fix'))}"
+            f"{table.file}: give the columns image and {', '.join(_PLACE)} (WGS 84), or {', '.join(_MAP)} with --epsg; "
+            f"optional columns: {', '.join((*_SIGMA, *_OPK, *_RPY, *sigmas_deg, 'fix'))}"
         )
     if not len(table):
         raise InputError(f"{table.file}: the file has no positions; omit it, or copy it again")
@@ -370,10 +370,8 @@ def with_exposures(photographs: Sequence[Photograph], files: Sequence[Exposures]
     have none from a time mark. If no file has antenna positions, it applies to the photographs' own positions.
     """
     assignment = _Assignment(photographs, arm)
-    messages = [
-        f"{file.file}: {assignment.assign(file)}"
-        for file in sorted(files, key=lambda f: 2 if f.names else 0 if f.sequence is not None else 1)
-    ]
+    order = lambda f: 3 if f.names else 0 if f.sequence is not None else 1 + assignment.is_track(f)  # noqa: E731
+    messages = [f"{file.file}: {assignment.assign(file)}" for file in sorted(files, key=order)]
     if arm is not None and not any(f.of_antenna for f in files):
         if any(assignment.own):
             messages.append(assignment.move_own(arm))
@@ -397,6 +395,10 @@ class _Assignment:
         # True if the position is from the photograph's own file.
         self.own = [True] * n
 
+    def is_track(self, file: Exposures) -> bool:
+        """Return True for a trajectory, False for exposures."""
+        return file.aircraft_deg is not None or len(file.time_s) > _TRACK * len(self.photographs)
+
     def assign(self, file: Exposures) -> str:
         """Assign the exposures of one file; return a message."""
         n = len(self.photographs)
@@ -404,7 +406,7 @@ class _Assignment:
             exposure, how = self._by_name(file), "by name"
         elif file.sequence is not None:
             exposure, how = self._by_number(file), "by number"
-        elif file.aircraft_deg is not None or len(file.time_s) > _TRACK * n:
+        elif self.is_track(file):
             if not np.isfinite(self.gps_s).any():
                 return (
                     "a trajectory needs the GPS time of every exposure to the millisecond, from time marks or "

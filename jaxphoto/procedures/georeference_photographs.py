@@ -111,11 +111,11 @@ def georeference_photographs(
     helping = rotation if isinstance(rotation, RecordedRotation) else None
     if helping is not None:
         similarity, used = _fit_with_rotation(there, here, helping.turn, own_sigmas)
-        if not helping.turn_sigma_rad < _rotation_sigma(here[used], sigmas[used]):
+        if not helping.turn_sigma_rad < _rotation_sigma(similarity.of(there)[used], sigmas[used]):
             similarity, helping = None, None
     if similarity is None:
         similarity, used = _fit_by_positions(there, here, own_sigmas)
-        if not (uncertainty := _rotation_sigma(here[used], sigmas[used])) <= _FIXED_RAD:
+        if not (uncertainty := _rotation_sigma(similarity.of(there)[used], sigmas[used])) <= _FIXED_RAD:
             raise InputError(
                 f"the {len(usable)} positions of the photographs lie on a line or determine the rotation of the block "
                 f"only to {np.rad2deg(uncertainty):.0f} degrees. Fly a cross strip, measure control points, or give "
@@ -161,16 +161,14 @@ def _check_upright(block: Block, similarity: Similarity) -> None:
         )
 
 
-def _rotation_sigma(here: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"]) -> float:
-    """Return the standard deviation (rad) of the rotation about the longest direction of the positions.
+def _rotation_sigma(network: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"]) -> float:
+    """Return the standard deviation (rad) of the rotation about the longest direction of the projection centres.
 
-    It follows from their extent across that direction.
+    It follows from the standard deviations of the positions and the extent of the network across that direction.
     """
-    across = np.linalg.svd(here - np.median(here, axis=0), compute_uv=False)
-    # The extent includes the scatter of the positions: remove it.
+    across = np.linalg.svd(network - network.mean(axis=0), compute_uv=False)
     noise = float(np.sqrt(np.mean(np.median(sigma, axis=0) ** 2)))
-    apart = np.sqrt(max(across[1] ** 2 - len(here) * noise**2, 0.0)) if len(across) > 1 else 0.0
-    return noise / apart if apart > 0 else np.inf
+    return noise / float(across[1]) if len(across) > 1 and across[1] > 0 else np.inf
 
 
 def _fit_with_rotation(
