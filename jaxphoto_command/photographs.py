@@ -260,7 +260,7 @@ def control(
     "jaxphoto calibrate board/*.jpg --board chessboard:8x6:square_mm=30 --out camera",
     "Boards: chessboard:8x6:square_mm=30, circles:4x11:spacing_mm=20:diameter_mm=15, "
     "aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50, "
-    "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50, targets:FILE.csv.",
+    "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50.",
 )
 def calibrate(
     output: Output,

@@ -150,8 +150,13 @@ def drone_record(fields: Mapping[str, str]) -> DroneRecord:
         utc = datetime.fromisoformat(fields.get(f"{space}:UTCAtExposure", "").rstrip("Z")).replace(tzinfo=None)
     except ValueError:
         utc = None
+    latitude, longitude = value(f"{space}:GpsLatitude"), value(f"{space}:GpsLongitude")
+    # Some firmware writes GpsLongtitude.
+    longitude = value(f"{space}:GpsLongtitude") if longitude is None else longitude
+    if above != space:
+        latitude, longitude = value(f"{above}:Latitude"), value(f"{above}:Longitude")
     return DroneRecord(
-        _plan(value, space),
+        None if latitude is None or longitude is None else (latitude, longitude),
         value(f"{above}:AbsoluteAltitude"),
         value(f"{above}:RelativeAltitude"),
         heights,
@@ -168,18 +173,6 @@ def fix_of(flag: float | None) -> Fix:
     if flag is None or not flag > 0:
         return "unknown"
     return "single" if flag < 32 else "float" if flag < 50 else "fixed"
-
-
-def _plan(value: Callable[[str], float | None], space: str) -> tuple[float, float] | None:
-    for latitude, longitude in (
-        (f"{space}:GpsLatitude", f"{space}:GpsLongitude"),
-        (f"{space}:GpsLatitude", f"{space}:GpsLongtitude"),
-        ("drone-skydio:Latitude", "drone-skydio:Longitude"),
-    ):
-        north, east = value(latitude), value(longitude)
-        if north is not None and east is not None:
-            return north, east
-    return None
 
 
 def _attitude(value: Callable[[str], float | None], space: str) -> CameraAttitude | None:
@@ -226,11 +219,8 @@ def gps_position(tags: Mapping[int, Any], drone: DroneRecord) -> Gps | None:
     return Gps(latitude, longitude, altitude, drone.sigma_m, drone.heights, drone.fix)
 
 
-def time_of_exposure(shot: Mapping[int, Any], gps: Mapping[int, Any], utc: datetime | None) -> Taken | None:
-    """Return the time of exposure: UTC from a drone's packet, else DateTimeOriginal; None if both are missing.
-
-    The UTC offset of the camera's clock is OffsetTimeOriginal, else its difference from the receiver's UTC time.
-    """
+def time_of_exposure(shot: Mapping[int, Any], utc: datetime | None) -> Taken | None:
+    """Return the time of exposure: UTC from a drone's packet, else DateTimeOriginal; None if both are missing."""
     if utc is not None:
         return Taken(gps_seconds(utc), 1e-6 if utc.microsecond else 1.0, 0.0)
     try:
@@ -241,17 +231,6 @@ def time_of_exposure(shot: Mapping[int, Any], gps: Mapping[int, Any], utc: datet
     has_fraction = bool(re.fullmatch(r"[0-9]{1,9}", digits)) and int(digits) > 0
     if has_fraction:
         clock += int(digits) / 10 ** len(digits)
-    return Taken(clock, 10.0 ** -len(digits) if has_fraction else 1.0, _ahead_of_utc(shot, gps, clock))
-
-
-def _ahead_of_utc(shot: Mapping[int, Any], gps: Mapping[int, Any], clock: float) -> float | None:
-    if zone := re.match(r"([+-])(\d\d):(\d\d)", text(shot.get(TAG.OffsetTimeOriginal))):
-        return (-1.0 if zone[1] == "-" else 1.0) * (3600 * int(zone[2]) + 60 * int(zone[3]))
-    try:
-        hour, minute, second = (float(part) for part in gps[7])
-        day = gps_seconds(datetime.strptime(text(gps.get(29))[:10], "%Y:%m:%d"))
-    except (KeyError, TypeError, ValueError, ZeroDivisionError, OverflowError):
-        return None
-    ahead = clock - (day + 3600 * hour + 60 * minute + second)
-    # Receivers store the time of their last position: determine only the time zone.
-    return 900.0 * round(ahead / 900.0) if abs(ahead) < 15 * 3600 else None
+    zone = re.match(r"([+-])(\d\d):(\d\d)", text(shot.get(TAG.OffsetTimeOriginal)))
+    ahead = (-1.0 if zone[1] == "-" else 1.0) * (3600 * int(zone[2]) + 60 * int(zone[3])) if zone else None
+    return Taken(clock, 10.0 ** -len(digits) if has_fraction else 1.0, ahead)

@@ -5,7 +5,6 @@ Pictures are used as stored, in sensor orientation: the EXIF orientation flag is
 
 import math
 import os
-import re
 from collections import Counter
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from pathlib import Path
@@ -39,7 +38,6 @@ _NOMINAL_PIXEL_MM = 0.005
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
 """File name extensions of pictures."""
-_RAW = (".dng", ".cr2", ".cr3", ".nef", ".arw", ".rw2", ".orf", ".raf", ".srw", ".pef")
 
 
 class Photograph(NamedTuple):
@@ -128,7 +126,7 @@ def _photograph(path: Path, width_px: int, height_px: int, exif: Exif) -> Photog
         drone.above_takeoff_m,
         drone.attitude,
         drone.aircraft_deg,
-        time_of_exposure(shot, exif.gps, drone.utc),
+        time_of_exposure(shot, drone.utc),
         text(shot.get(TAG.BodySerialNumber)) or serial or None,
         # Zero means no digital zoom.
         number(shot.get(TAG.DigitalZoomRatio), positive=True) or 1.0,
@@ -238,40 +236,31 @@ ONE_CAMERA: list[tuple[str, Callable[[Photograph], Hashable], str]] = [
 def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], dict[str, str]]:
     """Read the photographs of one camera in `paths`; return them, and the reason for each skipped file.
 
-    `paths` are files and folders. Skipped files: other formats, truncated files, duplicate names, identical and edited
-    copies, and files that differ from the majority in a property of `ONE_CAMERA`. Raises InputError for a missing path,
-    and if all files are skipped.
+    `paths` are files and folders. Skipped files: other formats, truncated files, duplicate names, identical copies, and
+    files that differ from the majority in a property of `ONE_CAMERA`. Raises InputError for a missing path, and if all
+    files are skipped.
     """
-    files = picture_files(paths)
+    files = list(dict.fromkeys(picture_files(paths)))
     if missing := [file for file in files if not (file.is_file() or file.is_symlink())]:
         raise InputError(f"{missing[0]}: there is no such photograph or folder; correct the name")
     skipped: dict[str, str] = {}
-    identical: dict[str, list[Photograph]] = {}
-    for file in files:
+    originals: dict[str, Photograph] = {}
+    by_name: dict[str, Photograph] = {}
+    # Among copies, the one with the shortest name is kept: "DJI_0002", not "DJI_0002 (1)".
+    for file in sorted(files, key=lambda file: len(file.name)):
         try:
             photograph = read_photograph(file)
             _check_complete(file)
         except InputError as error:
             skipped[str(file)] = str(error)
-        else:
-            identical.setdefault(input_file(file).sha256, []).append(photograph)
-    # Among identical files, prefer the most frequent form of name: "DJI_0002", not "DJI_0002 (1)".
-    series = Counter(_series(file.stem) for file in files)
-    by_name: dict[str, Photograph] = {}
-    originals = [min(copies, key=lambda p: (-series[_series(p.name)], len(p.name))) for copies in identical.values()]
-    for original, copies in zip(originals, identical.values(), strict=True):
-        for p in (p for p in copies if p is not original):
-            name = original.path if original.path.name == p.path.name else original.path.name
-            skipped[str(p.path)] = f"{p.path}: it is a copy of {name}"
-    position = {file: k for k, file in enumerate(files)}
-    for p in sorted(originals, key=lambda p: position[p.path]):
-        if by_name.setdefault(p.name, p) is not p:
-            skipped[str(p.path)] = f"{p.path}: {by_name[p.name].path} has the same name; rename one of them"
-    for p in by_name.values():
-        for other in (by_name.get(p.name[:k]) for k in range(1, len(p.name)) if not p.name[k].isalnum()):
-            if other and (p.taken, p.gps) == (other.taken, other.gps) != (None, None):
-                skipped[str(p.path)] = f"{p.path}: it is an edited copy of {other.path.name} (same time and position)"
-    valid = [p for p in by_name.values() if str(p.path) not in skipped]
+            continue
+        original = originals.setdefault(input_file(file).sha256, photograph)
+        if original is not photograph:
+            skipped[str(file)] = f"{file}: it is a copy of {original.path}"
+        elif by_name.setdefault(photograph.name, photograph) is not photograph:
+            skipped[str(file)] = f"{file}: {by_name[photograph.name].path} has the same name; rename one of them"
+    kept = {p.path: p for p in by_name.values()}
+    valid = [kept[file] for file in files if file in kept]
     for name, value_of, cure in ONE_CAMERA:
         values = Counter(v for p in valid if (v := value_of(p)) is not None)
         usual = values.most_common(1)[0][0] if values else None
@@ -280,7 +269,7 @@ def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
                 skipped[str(p.path)] = f"{p.path}: its {name} is {v}, that of most is {usual}; {cure}"
         valid = [p for p in valid if str(p.path) not in skipped]
     if not valid:
-        hints = list(skipped.values())[:1] or _hints(paths)
+        hints = [*skipped.values(), *skipped_subfolders(paths).values()][:1]
         raise InputError("; ".join([f"{', '.join(map(str, paths))}: there is no photograph that can be read", *hints]))
     return valid, skipped
 
@@ -309,41 +298,16 @@ def picture_files(paths: Sequence[str | Path]) -> list[Path]:
 
 
 def skipped_subfolders(paths: Sequence[str | Path]) -> dict[str, str]:
-    """Return subfolders with pictures that are not in `paths`, with a message each."""
-    named = {Path(path).resolve() for path in paths}
-    return {
-        str(inner): f"{inner}: {counted(n, 'picture')} in a folder that is not named; name it, too"
-        for path in map(Path, paths)
-        for inner, n in _subfolders(path)
-        if inner.resolve() not in named
-    }
-
-
-def _subfolders(folder: Path) -> list[tuple[Path, int]]:
-    """Return subfolders with camera pictures and their number of pictures, skipping folders that jaxphoto wrote."""
-    counts = []
-    for inner in sorted(folder.iterdir()) if folder.is_dir() else ():
+    """Return subfolders with pictures that are not in `paths`, with a message each; not those that jaxphoto wrote."""
+    named, messages = {Path(path).resolve() for path in paths}, {}
+    folders = (path for path in map(Path, paths) if path.is_dir())
+    for inner in (inner for folder in folders for inner in sorted(folder.iterdir())):
         readable = inner.is_dir() and os.access(inner, os.R_OK | os.X_OK) and not inner.name.startswith(".")
-        if readable and not (inner / MARKER).exists():
+        if readable and inner.resolve() not in named and not (inner / MARKER).exists():
             n = sum(f.suffix.lower() in SUFFIXES and f.suffix.lower() != ".png" for f in inner.iterdir())
-            counts += [(inner, n)] if n else []
-    return counts
-
-
-def _hints(paths: Sequence[str | Path]) -> list[str]:
-    """Return hints about subfolders and raw files in folders without pictures."""
-    folders = [path for path in map(Path, paths) if path.is_dir()]
-    inner = [str(path) for folder in folders for path, _ in _subfolders(folder)]
-    raw = [file.name for folder in folders for file in folder.iterdir() if file.suffix.lower() in _RAW]
-    hints = [f"there are pictures in {few(inner)}: name these folders"] if inner else []
-    if raw:
-        hints.append(f"raw files such as {raw[0]} are not read: develop all alike, without lens correction")
-    return hints
-
-
-def _series(name: str) -> str:
-    """Replace each run of digits in a name by "#"."""
-    return re.sub(r"\d+", "#", name)
+            if n:
+                messages[str(inner)] = f"{inner}: {counted(n, 'picture')} in a folder that is not named; name it, too"
+    return messages
 
 
 def _check_complete(file: Path) -> None:

@@ -16,7 +16,7 @@ from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control import ControlledBlock, control_block, retest
 from jaxphoto.procedures.control.frame import new_code, stated_system
 from jaxphoto.procedures.control.marks import images_of
-from jaxphoto.procedures.control.surveyed import GivenControl, check_near, fitting
+from jaxphoto.procedures.control.surveyed import GivenControl, check_near
 from jaxphoto.procedures.georeference_photographs import (
     GeoreferencedPhotographs,
     georeference_photographs,
@@ -56,12 +56,11 @@ def flight_control(
     """Check control against photographs, and return the EPSG code of the flight: `code`, or the code of the points.
 
     Raises InputError if no mark is in one of the `images`, for a missing or invalid system, for a local one together
-    with `code`, and for points far from the `positions`, with a system that would fit.
+    with `code`, and for points far from the `positions`.
     """
     recorded = [gps for gps in positions if gps is not None]
     place = np.median([(g.longitude_deg, g.latitude_deg) for g in recorded], axis=0) if recorded else None
-    guess = (lambda: fitting(control.points, None, *place)) if place is not None else (lambda: "")
-    stated = stated_system(control.points, system, guess)
+    stated = stated_system(control.points, system)
     if place is not None and stated.crs is not None:
         check_near(control.points, stated, *place)
     names = tuple(images)

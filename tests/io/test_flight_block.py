@@ -255,20 +255,6 @@ def test_invalid_trajectories_are_refused(fly, name):
         read_block(write(fly))
 
 
-def radians(records: Records, yaw) -> Records:
-    angles = np.deg2rad(np.column_stack([records.roll_pitch_yaw_deg[:, :2], np.broadcast_to(yaw, len(records.time))]))
-    return records._replace(roll_pitch_yaw_deg=angles)
-
-
-def test_a_trajectory_in_radians(fly):
-    records = flight()
-    there = records.time < START + 10
-    x = np.where(there, records.coordinates[:, 0], 1200 - records.coordinates[:, 0])
-    records = records._replace(coordinates=np.column_stack([x, records.coordinates[:, 1:]]))
-    with pytest.raises(InputError, match=r"flight\.csv: the yaw .* as radians, .*convert roll, pitch and yaw to deg"):
-        read_block(fly(radians(records, np.where(there, 90.0, 270.0))))
-
-
 # Motion in the tables ---------------------------------------------------------------------------------------
 
 
@@ -330,50 +316,6 @@ def test_motion_given_in_part(write_folder):
 
 
 # Units of attitudes -----------------------------------------------------------------------------------------
-
-
-def strips(write_folder, courses, yaw):
-    """Strips of five images in directions `courses` (degrees), yaw as `yaw(course)` writes it."""
-    images, stations, attitudes, measured = [], [], [], []
-    rng = np.random.default_rng(3)
-    for s, course in enumerate(courses):
-        for k in range(5):
-            name, east, north = f"{s}_{k}", np.sin(np.deg2rad(course)), np.cos(np.deg2rad(course))
-            images.append(f"{name},kodak,s{s},{100 * s + 5 * k}\n")
-            stations.append(f"{name},{60 * k * east + 300 * s},{60 * k * north},1000\n")
-            attitudes.append(f"{name},{0.02 * rng.normal():.4f},{0.02 * rng.normal():.4f},{yaw(course, rng):.4f}\n")
-            measured += [f"{name},p{p},{0.1 * p},0.2,,\n" for p in range(1, 5)]
-    head = "image,point,x_mm,y_mm,sigma_x_mm,sigma_y_mm\n"
-    return write_folder(
-        ("images.csv", "", "image,camera,strip,time_s\n" + "".join(images)),
-        ("stations.csv", "", "image,X_m,Y_m,Z_m\n" + "".join(stations)),
-        ("attitudes.csv", "", "image,roll_deg,pitch_deg,yaw_deg\n" + "".join(attitudes)),
-        ("image_points.csv", "", head + "".join(measured)),
-    )
-
-
-def in_radians(course, rng):
-    return np.deg2rad(course + 8 + rng.normal()) % (2 * np.pi)
-
-
-@pytest.mark.parametrize("courses", [(90, 270), (0, 180, 90), (10, 190, 10), (90,), (200, 200)])
-def test_attitudes_in_radians_are_refused(write_folder, courses):
-    with pytest.raises(InputError, match=r"attitudes\.csv: the yaw angles .* radians, not as degrees; convert roll"):
-        read_block(strips(write_folder, courses, in_radians))
-
-
-HONEST = {
-    "aircraft": ((0, 180, 90, 270), lambda course, rng: course + 10 * rng.normal()),
-    "north only": ((0, 0), lambda course, rng: 3 * rng.normal()),
-    "headings that stay north": ((0, 180, 90, 270), lambda course, rng: rng.normal()),
-    "headings of 1.57": ((90, 270), lambda course, rng: 1.57),
-    "backwards": ((90, 270), lambda course, rng: course - 180),
-}
-
-
-@pytest.mark.parametrize("name", HONEST)
-def test_honest_degrees_are_left_alone(write_folder, name):
-    read_block(strips(write_folder, *HONEST[name]))
 
 
 def test_a_flight_without_motion_is_still_a_block(write_folder):

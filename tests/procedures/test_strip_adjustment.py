@@ -25,12 +25,6 @@ from jaxphoto.procedures.lidar import ScannerPriors, adjust_strips
 from jaxphoto.procedures.lidar.scanner_checks import check_measured_from
 from jaxphoto.procedures.lidar.strip_model import _angles, knot_sigmas, step_rows
 from jaxphoto.report.strips import calibration_table, trajectory_errors_table
-from jaxphoto.rotation import (
-    matrix_from_quaternion,
-    matrix_from_roll_pitch_yaw,
-    quaternion_from_matrix,
-    roll_pitch_yaw_from_matrix,
-)
 from jaxphoto.simulation import Simulation
 from jaxphoto.unknowns import FIXED
 from jaxphoto_command.strip_flight import scanner_priors
@@ -264,7 +258,6 @@ def test_knots_are_named_by_strip_and_time():
         (lambda xyz, q: (xyz + np.array([3000.0, 0.0, 0.0]), q), "scatter about the scanner"),
         (lambda xyz, q: (xyz / 0.3048, q), "scatter about the scanner"),
         (lambda xyz, q: (xyz + np.array([4e5, 5e6, 0.0]), q), r"are \d+ km from the scanner's trajectory"),
-        (lambda xyz, q: (xyz, as_radians(q)), "agrees with its course in radians"),
     ],
 )
 def test_a_trajectory_that_cannot_be_the_cloud_s_is_refused(coordinates, sentence):
@@ -291,12 +284,6 @@ def test_a_jump_of_the_trajectory_is_reported():
     xyz[k:] += [0.0, 2.0, 0.0]
     odd = check_measured_from(flight.cloud, scanner_path(dataclasses.replace(flight.trajectory, position=xyz)))
     assert len(odd) == 1 and f"jumps by 2 m at {time[k]:.3f} s" in odd[0]
-
-
-def as_radians(quaternion):
-    """Angles in radians, read as degrees."""
-    angles = np.asarray(jax.vmap(roll_pitch_yaw_from_matrix)(jax.vmap(matrix_from_quaternion)(quaternion)))
-    return np.asarray(jax.vmap(quaternion_from_matrix)(jax.vmap(matrix_from_roll_pitch_yaw)(np.deg2rad(angles))))
 
 
 def test_the_sigmas_of_a_trajectory_are_those_of_its_knots():

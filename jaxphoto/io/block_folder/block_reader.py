@@ -16,7 +16,7 @@ from jaxphoto.errors import InputError, few
 from jaxphoto.georeferencing import RigCamera
 from jaxphoto.io.block_folder.camera_section import known_cameras, with_earlier_calibrations
 from jaxphoto.io.block_folder.declared_tables import Ids, known_kinds, layouts, own_tables, read_declared
-from jaxphoto.io.block_folder.flight import check_attitude_units, check_motion, read_flight
+from jaxphoto.io.block_folder.flight import check_motion, read_flight
 from jaxphoto.io.block_folder.map_tables import tables_to_local, with_origin
 from jaxphoto.io.block_folder.observations import (
     check_datum_points,
@@ -158,9 +158,7 @@ def assemble(source: BlockTables) -> Block:
     strips, strip_priors = read_strips(top.section("strips"), [n for n in dict.fromkeys(images.strips) if n])
     image_mount = tuple(mount_of[camera] for camera in images.cameras)
     flight = read_flight(tables, source.trajectory, images, frame, settings)
-    if source.trajectory is None:
-        check_attitude_units(tables["attitudes"], flight.stations, images)
-    else:
+    if source.trajectory is not None:
         # Remove stations and attitudes of rig cameras without a mount: their rig fixes them to the reference camera.
         rig = keys.unknowns.get(RigCamera.kind, {})
         heads = [c in rig and not m for c, m in zip(images.cameras, image_mount, strict=True)]

@@ -14,7 +14,6 @@ from jaxphoto.errors import BlockError, InputError
 from jaxphoto.georeferencing import Poses, RigCamera, covered, interpolate
 from jaxphoto.georeferencing.time_scales import DAY, LEAP_SECONDS, looks_like, shift_that_fits
 from jaxphoto.georeferencing.trajectory import SHORTEST
-from jaxphoto.georeferencing.yaw_units import counts_in_radians
 from jaxphoto.io.block_folder.observations import Images, read_attitudes, read_stations
 from jaxphoto.io.block_folder.settings import Settings, default_sigma
 from jaxphoto.io.block_folder.table_layout import RATE, VELOCITY
@@ -154,30 +153,6 @@ def _late_pairs(rows: Iterable[Any], cameras: Sequence[str], late: Collection[st
                     yield reference, cameras[image]
 
 
-def check_attitude_units(table: Table, stations: CameraPositions, images: Images) -> None:
-    """Check the unit of attitudes.csv by the direction of flight between consecutive images (`_check_yaw`)."""
-    yaw = np.full(len(images.ids), np.nan)
-    yaw[images.find(table)] = table.numbers("yaw_deg")
-    position = np.where(images.known[:, None], np.asarray(images.exterior.position), np.nan)
-    position[stations.who, stations.axis] = stations.value
-    strips = np.unique(np.array(images.strips, object).astype(str), return_inverse=True)[1]
-    order = np.lexsort((np.arange(len(strips)), images.times, strips))
-    same = strips[order[1:]] == strips[order[:-1]]
-    first, second = order[:-1][same], order[1:][same]
-    _check_yaw(yaw[first], position[second] - position[first], table.file)
-
-
-def _check_yaw(yaw: np.ndarray, flown: np.ndarray, file: str) -> None:
-    """Raise InputError if `yaw` agrees with the direction of flight `flown` in radians but not in degrees."""
-    course = np.arctan2(flown[:, 0], flown[:, 1])
-    known = ~np.isnan(course) & ~np.isnan(yaw)
-    if counts_in_radians(yaw[known], course[known]):
-        raise InputError(
-            f"{file}: the yaw angles are between {yaw[known].min():.2f} and {yaw[known].max():.2f} and follow the "
-            "direction of flight as radians, not as degrees; convert roll, pitch and yaw to degrees"
-        )
-
-
 def _interpolated(records: Records, images: Images, frame: Frame, settings: Settings) -> ObservedFlight:
     """Interpolate stations, attitudes and motion of the images at `time_s` + `shift_s`.
 
@@ -202,7 +177,6 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
                 f"columns such as sigma_{column}"
             )
     trajectory = trajectory_in(near, frame, sigmas[0], np.deg2rad(sigmas[1]))
-    _check_yaw(near.roll_pitch_yaw_deg[:-1, 2], np.diff(np.asarray(trajectory.position), axis=0), records.file)
     _check_inside(times, image, records, images, shift)
     for k in np.flatnonzero(~np.asarray(covered(trajectory, jnp.asarray(times), max_gap)))[:1]:
         i = np.clip(np.searchsorted(records.time, times[k], side="right") - 1, 0, len(records.time) - 2)

@@ -10,7 +10,7 @@ if more than half of the points are valid.
 """
 
 import dataclasses
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from itertools import combinations
 from typing import NamedTuple
 
@@ -25,7 +25,6 @@ from jaxphoto.procedures.control.surveyed import (
     SurveyedPoints,
     check_near,
     filled,
-    fitting,
     places,
     system_of,
 )
@@ -184,11 +183,9 @@ def in_frame(
 
     `words` is the coordinate system if the file does not specify one. `code` is the EPSG code of a new frame, by
     default the system of the points or UTM; `vertical` is the EPSG code of its heights, by default as in the points.
-    Raises InputError for a missing, contradictory or unusable system, and for points far from the block, with a system
-    that would fit.
+    Raises InputError for a missing, contradictory or unusable system, and for points far from the block.
     """
-    at = block.frame.origin
-    system = stated_system(points, words, lambda: fitting(points, None, *at[:2]) if at is not None else "")
+    system = stated_system(points, words)
     if block.frame.kind == "epsg":
         assert block.frame.code is not None and block.frame.origin is not None
         if code is not None and code != block.frame.code:
@@ -222,21 +219,17 @@ def in_frame(
     )
 
 
-def stated_system(points: SurveyedPoints, words: str | None, guess: Callable[[], str]) -> ControlSystem:
-    """Return the system in the file of `points`, or `words`.
-
-    Raises InputError if neither is given, with a `guess`, or if they differ.
-    """
+def stated_system(points: SurveyedPoints, words: str | None) -> ControlSystem:
+    """Return the system in the file of `points`, or `words`. Raises InputError if neither is given, or if they differ."""
     stated = system_of(points.system, points.file) if points.system else None
     given = system_of(words, "the EPSG code of the control") if words else None
     if stated and given and stated.crs != given.crs:
         raise InputError(f"{points.file} states {stated.name}, but {given.name} is given; omit the wrong one")
     system = stated or given
     if system is None:
-        would = guess()
         raise InputError(
             f"{points.file} does not state the coordinate system of its points; give its EPSG code (or local, for "
-            "Cartesian metres without a map)" + (f": they would fit {would}" if would else "")
+            "Cartesian metres without a map)"
         )
     return system
 

@@ -14,7 +14,6 @@ from jaxphoto.cloud import Cloud
 from jaxphoto.errors import BlockError, few
 from jaxphoto.georeferencing import Pattern, Trajectory
 from jaxphoto.georeferencing.time_scales import LEAP_SECONDS
-from jaxphoto.georeferencing.yaw_units import counts_in_radians
 from jaxphoto.lidar.correction import ScannerPath, scanner_poses
 from jaxphoto.lidar.coverage import CoveredTimes, longest_interval
 from jaxphoto.procedures.lidar.strip_model import aside
@@ -148,7 +147,7 @@ def _check_leap_seconds(cloud: Cloud, path: ScannerPath) -> None:
 
 
 def _odd_yaw(trajectory: Trajectory) -> list[str]:
-    """Raise BlockError for angles in radians; return a message if the body does not fly ahead."""
+    """Return a message if the body does not fly ahead."""
     step = np.diff(np.asarray(trajectory.position), axis=0)[:, :2]
     time, forward = np.diff(np.asarray(trajectory.time)), _forward(np.asarray(trajectory.quaternion))[:-1]
     fast = np.linalg.norm(step, axis=1) > _SLOW * time
@@ -157,11 +156,6 @@ def _odd_yaw(trajectory: Trajectory) -> list[str]:
     course, yaw = np.arctan2(*step[fast].T), np.arctan2(*forward[fast].T)
     if np.median(np.cos(yaw - course)) > _FOLLOWS:
         return []
-    if counts_in_radians(np.rad2deg(yaw), course):
-        raise BlockError(
-            "the yaw of the trajectory agrees with its course in radians, not in degrees: convert roll, pitch and "
-            "yaw to degrees"
-        )
     deviation = np.rad2deg(np.median(np.abs(np.arctan2(np.sin(yaw - course), np.cos(yaw - course)))))
     return [
         f"the yaw of the trajectory is {deviation:.0f} degrees off its course in the median, as in sideways or "

@@ -4,15 +4,13 @@ chessboard:8x6:square_mm=30            inner corners: columns x rows
 circles:4x11:spacing_mm=20:diameter_mm=15
 aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50
 charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50
-targets:FILE.csv                       circular targets with known coordinates
 """
 
 from collections.abc import Callable
-from pathlib import Path
 
 from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.targets.chessboard import Chessboard
-from jaxphoto.extras.photos.targets.circles import CircleGrid, CircularTargets
+from jaxphoto.extras.photos.targets.circles import CircleGrid
 from jaxphoto.extras.photos.targets.markers import DICTIONARIES, ArucoGrid, CharucoBoard
 from jaxphoto.extras.photos.targets.pattern import Pattern
 from jaxphoto.io.text_tables import is_number
@@ -22,7 +20,6 @@ SYNTAX = {
     "circles": "circles:4x11:spacing_mm=20:diameter_mm=15",
     "aruco": "aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50",
     "charuco": "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50",
-    "targets": "targets:FILE.csv",
 }
 """Syntax by kind of board."""
 
@@ -39,10 +36,6 @@ def read_board(description: str) -> Pattern:
     kind, _, rest = description.partition(":")
     if kind not in SYNTAX:
         raise InputError(f"--board {description}: unknown board {kind!r}; write one of {', '.join(SYNTAX.values())}")
-    if kind == "targets":
-        if not rest:
-            raise _bad(description, kind, "the file with the targets is missing")
-        return CircularTargets(Path(rest))
     size, *settings = rest.split(":")
     make, names, least = _MADE[kind]
     counts = size.lower().split("x")
