@@ -1,7 +1,6 @@
 """Commands that start from photographs."""
 
 import time
-from contextlib import ExitStack
 from functools import partial
 from itertools import count
 from pathlib import Path
@@ -65,7 +64,6 @@ def fly(
     from jaxphoto.georeferencing.recorded_positions import WGS84
     from jaxphoto.io.block_folder import whole_block
     from jaxphoto.io.exposures import exposure_files, located
-    from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
     from jaxphoto.io.photographs import (
         known_lens,
         sensor_and_interior,
@@ -93,13 +91,12 @@ def fly(
     control_files = [path for path in (control, marks) if path]
     check_folder(out, *photographs, *control_files, *(exposures or ()))
     surveyed = read_control(control, marks) if control else None
-    check_pieces(beside(out))
     code, vertical = map_codes(epsg)
     reference, arm = height_reference(heights), _lever_arm(lever_arm)
     if isinstance(reference, int):
         check_heights(WGS84, reference)
     Thread(target=prepare_pictures, daemon=True).start()
-    with output.progress("reading the photographs") as progress, ExitStack() as stack:
+    with output.progress("reading the photographs") as progress:
         read, corrupt = valid_photographs(photographs)
         for text in (*skipped_messages(corrupt), *skipped_subfolders(photographs).values()):
             output.warn(f"skipped: {text}")
@@ -116,7 +113,6 @@ def fly(
         compared = photograph_pairs(read, choice)
         matches = "pairs by similarity" if isinstance(compared, MostSimilar) else counted(len(compared), "pair")
         output.say(camera.origin, f"{counted(len(read), 'photograph')}, {matches} to match")
-        checkpoint = stack.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
             read,
             camera.sensor,
@@ -125,7 +121,6 @@ def fly(
             count=number,
             longest_px=longest_px or LONGEST_PX,
             in_parts=True,
-            keep=checkpoint,
             progress=progress.steps,
         )
         initial = camera.interior
@@ -175,7 +170,6 @@ def fly(
                     write_part_orientation(part, folder)
                     write_provenance(part, folder)
             no_certificate = certify(work)
-        checkpoint.remove()
     for k, (part, page) in enumerate(zip(flight.parts, reports, strict=True), 1):
         report = part.oriented.report
         size = f"{len(report.order)} photographs, {report.n_image_points} image points, {report.mean_px:.2f} px"
@@ -259,7 +253,6 @@ def control(
     PANEL,
     "jaxphoto calibrate board/*.jpg --board chessboard:8x6:square_mm=30 --out camera",
     "Boards: chessboard:8x6:square_mm=30, circles:4x11:spacing_mm=20:diameter_mm=15, "
-    "aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50, "
     "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50.",
 )
 def calibrate(
@@ -361,7 +354,6 @@ def orient(
     from jaxphoto.extras.photos.photograph_pairs import photograph_pairs, usual_choice
     from jaxphoto.io.block_folder import check_block_target, whole_block
     from jaxphoto.io.block_folder.table_layout import TOML
-    from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
     from jaxphoto.io.photographs import photographs, sensor_and_interior
     from jaxphoto.io.text_files import read_json
     from jaxphoto.procedures.calibration import distortion_model
@@ -386,15 +378,13 @@ def orient(
             )
         _orient_block(output, images[0], out)
         return
-    check_pieces(beside(out))
-    with output.progress("reading the photographs") as progress, ExitStack() as stack:
+    with output.progress("reading the photographs") as progress:
         read = photographs(images)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model or "brown", camera.sensor, r0_mm or 0.0)
         compared = photograph_pairs(read, pairs or usual_choice(read))
         output.say(camera.origin)
         initial = camera.interior
-        checkpoint = stack.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
             read,
             camera.sensor,
@@ -402,7 +392,6 @@ def orient(
             compared,
             count=features,
             longest_px=longest_px or LONGEST_PX,
-            keep=checkpoint,
             progress=progress.steps,
         )
         result = orient(
@@ -421,7 +410,6 @@ def orient(
         progress.update(f"writing {out}")
         with whole_block(result.block, out) as folder:
             write_orientation(result, folder, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
-        checkpoint.remove()
     output.say(
         f"{matched.n_gross} matches rejected before orientation (off the epipolar line, or in pairs with too few); "
         f"sigma factor of the others {matched.sigma_factor:.2g}"

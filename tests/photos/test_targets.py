@@ -18,7 +18,6 @@ BOARDS = (
     "chessboard:8x5:square_mm=22",
     "circles:4x9:spacing_mm=18:diameter_mm=15",
     "charuco:6x5:square_mm=30:marker_mm=21:dictionary=4X4_50",
-    "aruco:4x3:marker_mm=40:gap_mm=15:dictionary=4X4_50",
 )
 VIEWS = 3
 
@@ -150,7 +149,7 @@ def test_one_row_of_corners_between_markers_is_no_view_of_the_board():
         ("circles:4x2:spacing_mm=20:diameter_mm=15", ["3 rows"]),
         ("charuco:7x5:square_mm=30:marker_mm=40:dictionary=4X4_50", ["not smaller"]),
         ("charuco:7x5:square_mm=30:marker_mm=20:dictionary=9X9", ["9X9", "4X4_50"]),
-        ("aruco:9x9:marker_mm=30:gap_mm=5:dictionary=4X4_50", ["81 markers"]),
+        ("charuco:13x13:square_mm=30:marker_mm=20:dictionary=4X4_50", ["84 markers"]),
     ],
 )
 def test_a_wrong_description_is_one_sentence_with_the_syntax(description, words):

@@ -51,8 +51,6 @@ _LENGTH = 512
 # Standard deviation (px) of a feature of width 0, and its increase per pixel of width.
 _SIGMA_PX = 0.07
 _SIGMA_OF_WIDTH = 0.025
-METHOD = (1, _CONTRAST, _SIGMA_PX, _SIGMA_OF_WIDTH)
-"""Cache key of features; increment the first element when the detection changes."""
 
 
 class SiftFeatures(NamedTuple):

@@ -5,8 +5,6 @@ fundamental matrix or homography. Neither requires the principal distance. The E
 essential matrix would reject correct matches.
 """
 
-import contextlib
-import itertools
 import os
 import tempfile
 from collections.abc import Callable, Iterable, Sequence
@@ -21,11 +19,10 @@ from jaxtyping import Float, Int
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.compiling.freed_memory import freed_memory_kept
 from jaxphoto.errors import InputError
-from jaxphoto.extras.photos.features import LONGEST_PX, METHOD, SiftFeatures, sift_features
+from jaxphoto.extras.photos.features import LONGEST_PX, SiftFeatures, sift_features
 from jaxphoto.extras.photos.photograph_pairs import MostSimilar, largest_of, most_similar, usual_count
 from jaxphoto.initial.matches import MatchedPart, PairMatches, connected_images
 from jaxphoto.initial.rays import ideal_coordinates
-from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.io.photographs import Photograph
 from jaxphoto.procedures.orientation.colmap import MappedCamera, import_pycolmap, write_database
 
@@ -64,18 +61,14 @@ class MatchedPhotographs(NamedTuple):
     """Reason by name of each photograph without matches."""
 
     @property
-    def gross(self) -> Int[np.ndarray, "compared 3"]:
-        """Rows for all compared pairs: first, second, number of rejected matches."""
-        return np.column_stack([self.counts[:, :2], self.counts[:, 2] - self.counts[:, 3]])
-
-    @property
     def n_gross(self) -> int:
         """Total number of rejected matches."""
-        return int(self.gross[:, 2].sum())
+        return int((self.counts[:, 2] - self.counts[:, 3]).sum())
 
     def named(self, names: list[str]) -> MatchedPart:
         """Return the matches with these photograph names, as the input of `calibrate_flight`."""
-        return MatchedPart(names, self.xy_mm, self.sigma_mm, self.pairs, self.gross, self.sigma_factor)
+        gross = np.column_stack([self.counts[:, :2], self.counts[:, 2] - self.counts[:, 3]])
+        return MatchedPart(names, self.xy_mm, self.sigma_mm, self.pairs, gross, self.sigma_factor)
 
 
 def match_photographs(
@@ -87,15 +80,12 @@ def match_photographs(
     count: int | None = None,
     longest_px: int = LONGEST_PX,
     in_parts: bool = False,
-    keep: KeptPieces | None = None,
     progress: Progress = lambda step, done, of: None,
 ) -> MatchedPhotographs:
     """Match SIFT features between photographs of one camera; `pairs` contains index pairs.
 
     `count` limits the features per photograph: default 5,000, or 10,000 for up to 40 photographs. Photographs are
-    reduced to `longest_px`. `interior` is the known camera; only its distortion and principal point are used. Results
-    are stored in the checkpoint `keep`; an interrupted run continues from it.
-
+    reduced to `longest_px`. `interior` is the known camera; only its distortion and principal point are used.
     Photographs without features or matches are in `left_out`.
 
     Raises InputError as `sift_features`, if no two photographs match, and, unless `in_parts`, for unconnected groups;
@@ -103,49 +93,12 @@ def match_photographs(
     """
     if len(photographs) < 2:
         raise InputError("an orientation needs at least two overlapping photographs; give them all")
-    paths = [p.path for p in photographs]
-    matched = _matched(paths, sensor, interior, pairs, count, longest_px, keep, progress)
-    blank = [len(xy) == 0 for xy in matched.xy_mm]
-    alone = _alone([path.name for path in paths], blank, matched.pairs, in_parts)
-    return matched._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
-
-
-class _PairResult(NamedTuple):
-    """Concatenated results of several pairs."""
-
-    counts: Int[np.ndarray, "pairs 2"]
-    """Descriptor matches and verified matches."""
-    verified: Int[np.ndarray, "verified 2"]
-    off_line: Float[np.ndarray, "verified"]
-    """Distances from the epipolar lines divided by their standard deviations."""
-
-
-def _matched(
-    paths: list[Path],
-    sensor: Sensor,
-    interior: InteriorOrientation,
-    pairs: Iterable[tuple[int, int]] | MostSimilar,
-    most: int | None,
-    longest_px: int,
-    keep: KeptPieces | None,
-    progress: Progress,
-) -> MatchedPhotographs:
-    pycolmap, count = import_pycolmap(), most or usual_count(len(paths))
-
-    def find(path: Path) -> tuple[str, SiftFeatures]:
-        name = name_of("features", *METHOD, cv2.__version__, count, longest_px, sensor, path.read_bytes())
-        kept = keep.read(name) if keep else None
-        features = SiftFeatures(**kept) if kept else sift_features(path, sensor, count, longest_px)
-        if keep and kept is None:
-            keep.write(name, **features._asdict())
-        return name, features
-
-    names, features = [], []
+    pycolmap, paths, most = import_pycolmap(), [p.path for p in photographs], count or usual_count(len(photographs))
+    features: list[SiftFeatures] = []
     with freed_memory_kept(), ThreadPoolExecutor(os.cpu_count()) as workers:
-        for k, (name, of_photograph) in enumerate(workers.map(find, paths)):
-            names.append(name)
-            features.append(of_photograph)
-            progress("features", k + 1, len(paths))
+        for found in workers.map(lambda path: sift_features(path, sensor, most, longest_px), paths):
+            features.append(found)
+            progress("features", len(features), len(paths))
     if isinstance(pairs, MostSimilar):
         largest = [largest_of(of_photograph) for of_photograph in features]
         pairs = most_similar(
@@ -154,36 +107,29 @@ def _matched(
     compared = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
     ideal_px = [sensor.px_from_mm(ideal_coordinates(interior, f.xy_mm)) for f in features]
     off_line_px = _OFF_LINE * float(np.hypot(sensor.width_px, sensor.height_px))
-    results = []
-    with contextlib.ExitStack() as opened:
-        database: Path | None = None
+    counts, matched, off_line = [np.zeros((0, 2), int)], list[np.ndarray](), [np.zeros(0)]
+    with tempfile.TemporaryDirectory() as folder:
+        database = _database(pycolmap, Path(folder), sensor, features, ideal_px)
         for begin in range(0, len(compared), _CHUNK):
             chunk = compared[begin : begin + _CHUNK]
-            each = [(names[k], ideal_px[k].tobytes()) for pair in chunk for k in pair]
-            name = name_of("matches", *METHOD, pycolmap.__version__, _MIN_RATIO, off_line_px, *itertools.chain(*each))
-            kept = keep.read(name) if keep else None
-            if kept is None:
-                if database is None:
-                    folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
-                    database = _database(pycolmap, folder, sensor, features, ideal_px)
-                kept = _match_pairs(pycolmap, database, chunk, features, ideal_px, sensor, off_line_px)._asdict()
-                if keep:
-                    keep.write(name, **kept)
-            results.append(_PairResult(**kept))
+            of_chunk = _match_pairs(pycolmap, database, chunk, features, ideal_px, sensor, off_line_px)
+            counts.append(of_chunk[0])
+            matched += of_chunk[1]
+            off_line += of_chunk[2]
             progress("matches", begin + len(chunk), len(compared))
-    numbers = np.concatenate([np.zeros((0, 2), int), *(r.counts for r in results)])
-    verified = np.concatenate([np.zeros((0, 2), int), *(r.verified for r in results)])
-    off_line = np.concatenate([np.zeros(0), *(r.off_line for r in results)])
-    by_pair = np.split(verified, np.cumsum(numbers[:, 1]))[:-1]
-    factor = float(np.quantile(np.abs(off_line), _QUANTILE)) / _QUANTILE_SIGMA if len(off_line) else 1.0
-    return MatchedPhotographs(
+    scatter = np.abs(np.concatenate(off_line))
+    factor = float(np.quantile(scatter, _QUANTILE)) / _QUANTILE_SIGMA if len(scatter) else 1.0
+    result = MatchedPhotographs(
         [f.xy_mm for f in features],
         [factor * f.sigma_mm for f in features],
         factor,
-        [PairMatches(*pair, matches) for pair, matches in zip(compared, by_pair, strict=True) if len(matches)],
-        np.column_stack([np.array(compared, int).reshape(-1, 2), numbers]),
+        [PairMatches(*pair, matches) for pair, matches in zip(compared, matched, strict=True) if len(matches)],
+        np.column_stack([np.array(compared, int).reshape(-1, 2), np.concatenate(counts)]),
         {},
     )
+    blank = [len(xy) == 0 for xy in result.xy_mm]
+    alone = _alone([path.name for path in paths], blank, result.pairs, in_parts)
+    return result._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
 
 
 def _database(pycolmap: Any, folder: Path, sensor: Sensor, features: list[SiftFeatures], ideal_px: list) -> Path:
@@ -200,7 +146,8 @@ def _database(pycolmap: Any, folder: Path, sensor: Sensor, features: list[SiftFe
 
 def _match_pairs(
     pycolmap: Any, database: Path, pairs: list[tuple[int, int]], features, ideal_px, sensor: Sensor, off_line_px: float
-) -> _PairResult:
+) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
+    """Match pairs; return counts of descriptor and verified matches, verified matches, and `_over_sigma` of these."""
     (database.parent / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(database.parent / "pairs.txt")
@@ -211,7 +158,7 @@ def _match_pairs(
     pycolmap.match_image_pairs(
         database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
     )
-    counts, verified, off_line = [], [np.zeros((0, 2), int)], [np.zeros(0)]
+    counts, verified, off_line = [], [], []
     with pycolmap.Database.open(database) as stored:
         for a, b in pairs:
             geometry = stored.read_two_view_geometry(a + 1, b + 1).inlier_matches
@@ -226,7 +173,7 @@ def _match_pairs(
                 one, other = ideal_px[a][rows[:, 0]], ideal_px[b][rows[:, 1]]
                 sigmas = (features[k].sigma_mm[r] / sensor.pixel_mm for k, r in zip((a, b), rows.T, strict=True))
                 off_line.append(_over_sigma(off_line_px, one, other, *sigmas))
-    return _PairResult(np.array(counts, int).reshape(-1, 2), np.concatenate(verified), np.concatenate(off_line))
+    return np.array(counts, int).reshape(-1, 2), verified, off_line
 
 
 def _places(matches: Int[np.ndarray, "n 2"], one: np.ndarray, other: np.ndarray) -> Int[np.ndarray, "places 2"]:

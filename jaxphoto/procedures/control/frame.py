@@ -220,7 +220,7 @@ def in_frame(
 
 
 def stated_system(points: SurveyedPoints, words: str | None) -> ControlSystem:
-    """Return the system in the file of `points`, or `words`. Raises InputError if neither is given, or if they differ."""
+    """Return the system in the file of `points`, else `words`. Raises InputError for none, and if they differ."""
     stated = system_of(points.system, points.file) if points.system else None
     given = system_of(words, "the EPSG code of the control") if words else None
     if stated and given and stated.crs != given.crs:

@@ -2,7 +2,6 @@
 
 chessboard:8x6:square_mm=30            inner corners: columns x rows
 circles:4x11:spacing_mm=20:diameter_mm=15
-aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50
 charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50
 """
 
@@ -11,14 +10,13 @@ from collections.abc import Callable
 from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.targets.chessboard import Chessboard
 from jaxphoto.extras.photos.targets.circles import CircleGrid
-from jaxphoto.extras.photos.targets.markers import DICTIONARIES, ArucoGrid, CharucoBoard
+from jaxphoto.extras.photos.targets.markers import DICTIONARIES, CharucoBoard
 from jaxphoto.extras.photos.targets.pattern import Pattern
 from jaxphoto.io.text_tables import is_number
 
 SYNTAX = {
     "chessboard": "chessboard:8x6:square_mm=30",
     "circles": "circles:4x11:spacing_mm=20:diameter_mm=15",
-    "aruco": "aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50",
     "charuco": "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50",
 }
 """Syntax by kind of board."""
@@ -26,7 +24,6 @@ SYNTAX = {
 _MADE: dict[str, tuple[Callable[..., Pattern], tuple[str, ...], int]] = {
     "chessboard": (Chessboard, ("square_mm",), 3),
     "circles": (CircleGrid, ("spacing_mm", "diameter_mm"), 2),
-    "aruco": (ArucoGrid, ("marker_mm", "gap_mm", "dictionary"), 1),
     "charuco": (CharucoBoard, ("square_mm", "marker_mm", "dictionary"), 2),
 }
 
