@@ -362,19 +362,10 @@ def orient(
 
     check_block_target(out, *images)
     if len(images) == 1 and (images[0] / TOML).is_file():
-        values = {
-            "pairs": pairs,
-            "features": features,
-            "longest-px": longest_px,
-            "c-mm": c_mm,
-            "pixel-mm": pixel_mm,
-            "model": model,
-            "r0-mm": r0_mm,
-        }
-        if names := [f"--{name}" for name, value in values.items() if value is not None]:
+        if any(v is not None for v in (pairs, features, longest_px, c_mm, pixel_mm, model, r0_mm)):
             raise typer.BadParameter(
-                f"{images[0]} is a block folder with its own image points and cameras: omit {', '.join(names)}, or "
-                "change block.toml."
+                f"{images[0]} is a block folder with its own image points and cameras: omit the options, or change "
+                "block.toml."
             )
         _orient_block(output, images[0], out)
         return

@@ -358,7 +358,7 @@ def located(
     positions, corrections = plausible_positions({p.name: p.gps for p in assigned.photographs})
     above = {p.name: p.above_takeoff_m for p in assigned.photographs}
     positions, height_messages = one_height(positions, above, heights)
-    messages += [*assigned.sentences, *corrections, *_own_files_message(photographs), *height_messages]
+    messages += [*assigned.sentences, *corrections, *height_messages]
     return Assigned([p._replace(gps=positions[p.name]) for p in assigned.photographs], list(map(shown, messages)))
 
 
@@ -560,20 +560,6 @@ def _interpolated(track: Exposures, times_s: Float[np.ndarray, "n"]) -> Exposure
     place[~inside], sigma[~inside] = np.nan, np.nan
     fix = tuple(track.fix[k] for k in nearest)
     return track._replace(time_s=times_s, place=place, sigma_m=sigma, fix=fix, aircraft_deg=aircraft)
-
-
-def _own_files_message(photographs: Sequence[Photograph]) -> list[str]:
-    """Report attitudes, heights, sigmas and kinds of solution in the files of the photographs."""
-    positions = [p.gps for p in photographs if p.gps]
-    known = {
-        "attitudes": [p.attitude is not None for p in photographs],
-        "heights above take-off": [p.above_takeoff_m is not None for p in photographs],
-        "standard deviations of positions": [g.sigma_m is not None for g in positions],
-    }
-    parts = [name if all(v) else f"{name} ({sum(v)} of {len(v)})" for name, v in known.items() if any(v)]
-    if solutions := _fix_counts([g.fix for g in positions]):
-        parts.append(f"solutions{solutions.replace(',', ':', 1)}")
-    return [f"the photographs' own files have {', '.join(parts)}"] if parts else []
 
 
 def _fix_counts(kinds: Sequence[Fix]) -> str:

@@ -7,7 +7,6 @@ import pytest
 from PIL import Image
 
 from jaxphoto.errors import InputError
-from jaxphoto.io.exposures import located
 from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
 from jaxphoto.io.photographs import photographs, skipped_messages, skipped_subfolders, valid_photographs
 
@@ -34,18 +33,6 @@ def test_sound_ones_are_kept_with_what_their_files_say(folder):
     kept, left = valid_photographs([folder])
     assert [p.name for p in kept] == ["0", "1", "2", "3"] and not left
     assert kept[0].gps is not None and kept[0].gps.sigma_m == (0.01174, 0.01262, 0.02684)
-
-
-def test_what_packets_tell_is_said(folder):
-    """A solution without corrections has no standard deviations; angles that are no three are no attitude."""
-    picture = Image.open(folder / "3.jpg")
-    packet = PACKET.replace('RtkFlag="50"', 'RelativeAltitude="+80.1" drone-dji:RtkFlag="0"')
-    picture.save(folder / "3.jpg", exif=picture.getexif(), xmp=packet.encode())
-    kept, _ = valid_photographs([folder])
-    assert located(kept).sentences[0] == (
-        "the photographs' own files have heights above take-off (1 of 4), standard deviations of positions (3 of 4), "
-        "solutions: 3 fixed"
-    )
 
 
 def test_of_several_copies_each_names_the_one_that_is_kept(folder):

@@ -11,14 +11,13 @@ from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block, Frame, Motion
 from jaxphoto.compiling import jit_quickly
 from jaxphoto.errors import BlockError, InputError
-from jaxphoto.georeferencing import Poses, RigCamera, covered, interpolate
-from jaxphoto.georeferencing.time_scales import DAY, LEAP_SECONDS, looks_like, shift_that_fits
+from jaxphoto.georeferencing import RigCamera, covered, interpolate
 from jaxphoto.georeferencing.trajectory import SHORTEST
 from jaxphoto.io.block_folder.observations import Images, read_attitudes, read_stations
 from jaxphoto.io.block_folder.settings import Settings, default_sigma
 from jaxphoto.io.block_folder.table_layout import RATE, VELOCITY
 from jaxphoto.io.text_tables import Table
-from jaxphoto.io.trajectory import Records, positions_in, trajectory_in
+from jaxphoto.io.trajectory import Records, trajectory_in
 from jaxphoto.observations import Attitudes, CameraPositions, RelativeAttitudes, RelativePositions, RigPlaces, RigTurns
 from jaxphoto.rotation import roll_pitch_yaw_from_matrix
 from jaxphoto.unknowns import FIXED, Unknowns, late_cameras
@@ -177,7 +176,7 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
                 f"columns such as sigma_{column}"
             )
     trajectory = trajectory_in(near, frame, sigmas[0], np.deg2rad(sigmas[1]))
-    _check_inside(times, image, records, images, shift)
+    _check_inside(times, image, records, images)
     for k in np.flatnonzero(~np.asarray(covered(trajectory, jnp.asarray(times), max_gap)))[:1]:
         i = np.clip(np.searchsorted(records.time, times[k], side="right") - 1, 0, len(records.time) - 2)
         raise images.table.misfit(
@@ -187,7 +186,6 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
             "max_gap_s under [trajectory]",
         )
     poses = jax.tree.map(np.asarray, _interpolate(trajectory, jnp.asarray(times), max_gap))
-    _check_leap_seconds(poses, times, image, records, images, frame, shift)
     velocity, rate = np.zeros((len(images.ids), 3)), np.zeros((len(images.ids), 3))
     velocity[image], rate[image] = poses.velocity, poses.rate
     who, axis = np.repeat(image, 3), np.tile(np.arange(3), len(image))
@@ -212,57 +210,13 @@ def _taken(records: Records, chosen: np.ndarray) -> Records:
     return records._replace(**{n: v[chosen] for n, v in records._asdict().items() if isinstance(v, np.ndarray)})
 
 
-def _check_inside(times: np.ndarray, image: np.ndarray, records: Records, images: Images, shift: float) -> None:
-    """Raise BlockError for an exposure outside the trajectory; report the clock shift if one explains it."""
+def _check_inside(times: np.ndarray, image: np.ndarray, records: Records, images: Images) -> None:
+    """Raise BlockError for an exposure outside the trajectory."""
     start, end = float(records.time[0]), float(records.time[-1])
-    outside = np.flatnonzero((times < start) | (times > end))
-    if not len(outside):
-        return
-    first, missing = image[outside[0]], shift_that_fits(times, start, end)
-    if missing is not None:
-        cure = f"write shift_s = {missing + shift:.15g} under [trajectory] to bring all exposures into it"
-        if missing % DAY == 0:
-            cure += f" (and {LEAP_SECONDS[0]} s more if time_s is UTC)"
-    elif times.min() < 600 and len(outside) == len(times):
-        cure = (
-            "give GPS times in images.csv, or the time of the first exposure on the clock of the trajectory as "
-            "shift_s under [trajectory]"
-        )
-    else:
-        cure = "use a trajectory that covers it, correct time_s, or leave time_s empty"
-    raise images.table.misfit(
-        first,
-        f"image {images.ids[first]} is exposed outside {records.file}: exposures at {looks_like(times)}, "
-        f"trajectory at {looks_like(records.time)}; {cure}",
-    )
-
-
-def _check_leap_seconds(
-    poses: Poses, times: np.ndarray, image: np.ndarray, records: Records, images: Images, frame: Frame, shift: float
-) -> None:
-    """Raise BlockError if approximate positions fit the trajectory only after a shift by leap seconds."""
-    known = images.known[image]
-    if not known.any():
-        return
-    expected = np.asarray(images.exterior.position)[image[known]]
-
-    def distance(leap: float) -> float:
-        """Return the median distance to the trajectory at shifted times, limited to its first and last record."""
-        last = np.clip(np.searchsorted(records.time, times[known] + leap), 1, len(records.time) - 1)
-        before, after = (positions_in(_taken(records, k), frame) for k in (last - 1, last))
-        span = records.time[last] - records.time[last - 1]
-        part = np.clip((times[known] + leap - records.time[last - 1]) / span, 0.0, 1.0)[:, None]
-        return float(np.median(np.linalg.norm((1 - part) * before + part * after - expected, axis=1)))
-
-    now, speed = distance(0.0), float(np.median(np.linalg.norm(poses.velocity, axis=1)))
-    # Below half of the smallest leap-second shift, approximate positions cannot distinguish the time scales.
-    if now <= 0.5 * min(LEAP_SECONDS) * speed:
-        return
-    distances = {sign * leap: distance(sign * leap) for leap in LEAP_SECONDS for sign in (1, -1)}
-    best = min(distances, key=lambda leap: distances[leap])
-    if distances[best] < 0.1 * now:
-        raise BlockError(
-            f"{images.table.file}: the approximate positions are {now:.0f} m from {records.file} at time_s, but "
-            f"{distances[best]:.0f} m at {best:+d} s, so one clock is UTC and the other GPS; write "
-            f"shift_s = {best + shift:.15g} under [trajectory]"
+    for k in np.flatnonzero((times < start) | (times > end))[:1]:
+        raise images.table.misfit(
+            image[k],
+            f"image {images.ids[image[k]]} is exposed outside {records.file}: exposures at {times.min():.3f} to "
+            f"{times.max():.3f} s, trajectory at {start:.3f} to {end:.3f} s; correct time_s, leave it empty, or give "
+            "the offset of the time scales as shift_s under [trajectory] (GPS time minus UTC: 18 s since 2017)",
         )

@@ -245,7 +245,9 @@ def control_block(
         start[which] = np.asarray(adjusted.unknowns.points)[len(base.points) :]
     left = seen & ~points.check & ~used
     messages = [*_assumed(control, sigma), *messages]
-    messages += _left_out(ids, left, tested, frame)
+    for k in np.flatnonzero(left):
+        offset = ", ".join(f"{v:.3g}" for v in tested.off_m[k])
+        messages.append(f"control point {ids[k]} contradicts the rest by {offset} m (east, north, up) and is rejected")
     state = np.where(points.check, "check", np.where(used, "control", "left out"))
     state = np.where(seen, state, "not marked")
     if not_marked := [ids[k] for k in np.flatnonzero(~seen)]:
@@ -343,17 +345,6 @@ def _tested(tested: TestedControl, now: Marked, used, able, ids, images):
             f"the mark of {ids[p]} in {image} is {off:.3g} px off (w = {tested.marks_w[row]:.3g}) and rejected"
         )
     return new, rejected, messages
-
-
-def _left_out(ids, left, tested: TestedControl, frame: InFrame):
-    for k in np.flatnonzero(left):
-        offset = ", ".join(f"{v:.3g}" for v in tested.off_m[k])
-        text = f"control point {ids[k]} contradicts the rest by {offset} m (east, north, up) and is rejected"
-        near = np.linalg.norm(frame.xyz - tested.adjusted_m[k], axis=1)
-        other = int(np.argmin(np.where(np.arange(len(ids)) == k, np.inf, near)))
-        if near[other] < 0.1 * np.linalg.norm(tested.off_m[k]):
-            text += f": its marks show {ids[other]}; check the names"
-        yield text
 
 
 def _spread(tested: TestedControl, seen) -> TestedControl:
