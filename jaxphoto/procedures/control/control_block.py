@@ -32,11 +32,6 @@ CRITICAL = 4.0
 
 # Minimum number of residuals for a scatter estimate; median of the larger of two standard normal errors.
 _ENOUGH, _LARGER = 8, 1.05
-# Minimum number of surveyed points for a scatter estimate; median of |N(0, 1)|; ratio of scatters above which a default
-# is rejected (the median of twelve exceeds 1.9 in one valid block of a hundred).
-_POINTS, _MEDIAN, _MORE = 6, 0.6745, 2.0
-# Maximum change of log(sigma) that does not require another adjustment.
-_STILL = 0.15
 
 
 class TestedControl(NamedTuple):
@@ -97,35 +92,6 @@ def scatter(marks_w: Float[np.ndarray, "rows"]) -> float:
     """
     finite = marks_w[np.isfinite(marks_w)]
     return max(1.0, float(np.median(finite)) / _LARGER) if len(finite) >= _ENOUGH else 1.0
-
-
-def poorer_survey(
-    w: Float[np.ndarray, "points 3"],
-    sigma_m: Float[np.ndarray, "points 3"],
-    assumed: Bool[np.ndarray, "points 3"],
-    guess_m: tuple[float, float, float],
-) -> Float[np.ndarray, "3"] | None:
-    """Estimate sigmas (m) of the coordinates `assumed` that explain most of them; return None if `sigma_m` does.
-
-    They follow from the medians of the normalised residuals of plan and height, so up to half of the points may be
-    blunders. Control with too much weight deforms the block, so several adjustments are needed: after the default
-    `guess_m` is rejected, standard deviations may also decrease. In the first estimate heights are as inaccurate as the
-    plan.
-    """
-    now, given_up = np.array(guess_m), bool((sigma_m[assumed] > max(guess_m)).any())
-    factor = np.ones(3)
-    for axes in ([0, 1], [2]):
-        if assumed[:, axes].any():
-            now[axes] = np.median(sigma_m[:, axes][assumed[:, axes]])
-        tested = assumed[:, axes] & np.isfinite(w[:, axes])
-        if tested.any(axis=1).sum() >= _POINTS:
-            factor[axes] = np.median(w[:, axes][tested]) / _MEDIAN
-    if given_up:
-        return None if np.abs(np.log(factor)).max() < _STILL else np.maximum(factor * now, guess_m)
-    if factor.max() < _MORE:
-        return None
-    poorer = np.maximum(factor, 1) * now
-    return np.maximum(poorer, poorer[0])
 
 
 def beyond(w: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
@@ -191,11 +157,11 @@ def control_block(
     rows, messages = rows.take(met.good), [*messages, *met.sentences]
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
     try:
-        block, start, agree, sigma, seen_sigma = _placed(block, frame, met.points, met.covariance, sigma, points)
+        block, start, agree, placed_messages = _placed(block, frame, met.points, met.covariance, sigma, points)
     except InputError as error:
         # Rejected marks explain why too few points remain.
         raise InputError("; ".join([str(error), *_one_height(points), *met.sentences[:_SAID]])) from error
-    messages += seen_sigma
+    messages += placed_messages
     count = np.bincount(rows.point, minlength=len(ids))
     known = np.where(np.isnan(points.coordinates), np.nan, frame.xyz)
     # One ray of a known point is an observation; one ray of an unknown point is not.
@@ -222,15 +188,10 @@ def control_block(
             adjusted = adjust(controlled)
         except DatumError as error:
             # The default standard deviations may be the reason why control does not determine the datum.
-            raise DatumError("; ".join([str(error), *_assumed(control, sigma)])) from error
+            raise DatumError("; ".join([str(error), *_assumed(control)])) from error
         if not bool(adjusted.converged):
             messages.append("the adjustment with control did not converge; it is not tested")
         tested = _spread(test_control(adjusted, len(which), known[which], sigma[which]), seen)
-        poorer = poorer_survey(tested.w[used], sigma[used], np.isnan(points.sigma_m[used]), SIGMA_M)
-        if poorer is not None and number + 1 < _ROUNDS and bool(adjusted.converged):
-            # Estimate standard deviations before testing points: most may contradict the default.
-            sigma = np.where(np.isnan(points.sigma_m), poorer, sigma)
-            continue
         new, rejected, text = _tested(tested, now, used, seen & ~points.check, ids, block.images)
         key = (used.tobytes(), len(now.image))
         if number + 1 == _ROUNDS or not text or key in tried or not bool(adjusted.converged):
@@ -244,7 +205,7 @@ def control_block(
         base = _from(base, adjusted)
         start[which] = np.asarray(adjusted.unknowns.points)[len(base.points) :]
     left = seen & ~points.check & ~used
-    messages = [*_assumed(control, sigma), *messages]
+    messages = [*_assumed(control), *messages]
     for k in np.flatnonzero(left):
         offset = ", ".join(f"{v:.3g}" for v in tested.off_m[k])
         messages.append(f"control point {ids[k]} contradicts the rest by {offset} m (east, north, up) and is rejected")
@@ -262,7 +223,7 @@ def control_block(
 def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: SurveyedPoints):
     """Transform the block to the frame of control.
 
-    Return block, initial points, consistent points, standard deviations of the survey, and messages.
+    Return block, initial points, consistent points, and messages.
     """
     whole = np.isfinite(points.coordinates).all(axis=1)
     known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~points.check & whole)
@@ -273,16 +234,14 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
         how = " lie on a line, so the rotation about it is undetermined" if line else ""
         stays = f"the block stays {'at its positions' if by_positions else 'where it lies'}"
         messages = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
-        return block, met, agree, sigma, messages
+        return block, met, agree, messages
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
-    assumed, surveyed = np.isnan(points.sigma_m[known]).any(axis=1), np.linalg.norm(sigma[known], axis=1)
+    surveyed = np.linalg.norm(sigma[known], axis=1)
     if not frame.at_place:
         # `spread` is in the unit of the block: convert it by the scale of a first similarity.
-        first = onto_control(met[known], frame.xyz[known], surveyed, points.file, assumed)
+        first = onto_control(met[known], frame.xyz[known], surveyed, points.file)
         spread = spread * first.similarity.scale
-    onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file, assumed)
-    if onto.scatter_m is not None:
-        sigma = np.where(np.isnan(points.sigma_m), onto.scatter_m, sigma)
+    onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file)
     agree[known] = onto.agree
     messages = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} bring the block to their frame"]
     if frame.at_place:
@@ -291,18 +250,15 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
         there = "the positions of the photographs have" if by_positions else "the block has"
         messages.append(f"control lies {offset} m (east, north, up) from where {there} it")
     block = dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame)
-    return block, onto.similarity.of(met), agree, sigma, messages
+    return block, onto.similarity.of(met), agree, messages
 
 
-def _assumed(control: GivenControl, sigma: Float[np.ndarray, "points 3"]) -> list[str]:
-    messages, none = [], np.isnan(control.points.sigma_m)
-    if n := int(none.any(axis=1).sum()):
-        taken = np.where(none, sigma, 0.0).max(axis=0)
-        why = "they scatter about the photographs: " if (taken > SIGMA_M).any() else ""
-        east, north, up = np.where(none.any(axis=0), np.maximum(taken, SIGMA_M), SIGMA_M)
+def _assumed(control: GivenControl) -> list[str]:
+    messages = []
+    if n := int(np.isnan(control.points.sigma_m).any(axis=1).sum()):
         messages.append(
-            f"{n} surveyed points have no standard deviations: {why}{max(east, north):.2g} m east and north, {up:.2g} "
-            "m up are assumed"
+            f"{n} surveyed points have no standard deviations: {max(SIGMA_M[:2]):.2g} m east and north, "
+            f"{SIGMA_M[2]:.2g} m up are assumed"
         )
     messages += _one_height(control.points)
     if n := int(np.isnan(control.marks.sigma_px).sum()):

@@ -3,10 +3,6 @@
 Every three points (or 300 samples of three) determine a similarity. The one with the most consistent points is refined
 by least squares of these. The tolerance allows for deformations that the adjustment removes: distortion, or weakly
 determined positions. The first adjustment, which tests all points, starts without inconsistent ones.
-
-If standard deviations are defaults and most points are inconsistent, the survey may be less accurate (a hand-held
-receiver: metres). The similarity of the least median of squares (P. J. Rousseeuw, JASA 79, 1984) estimates the accuracy
-if more than half of the points are valid.
 """
 
 import dataclasses
@@ -35,13 +31,6 @@ _SAMPLES = 300
 # Tolerance of a point: number of standard deviations plus fraction of the extent of the control.
 _BEYOND, _BENT = 5.0, 0.01
 MIN_POINTS = 3
-# Fraction of consistent points below which the survey may be less accurate than assumed; minimum number of points.
-_MOST, _ENOUGH = 2 / 3, 6
-# Ratio of the median length of 3-D normal errors to their sigma; number of parameters of a similarity.
-_MEDIAN, _PARAMETERS = 1.54, 7
-# Maximum residual (standard deviations) in the refined estimate; maximum ratio of the standard deviation to the extent
-# of the control: above it, points or the order of coordinates are wrong.
-_WITHIN, _POOREST = 3.5, 0.05
 
 
 class OntoControl(NamedTuple):
@@ -49,8 +38,6 @@ class OntoControl(NamedTuple):
 
     similarity: Similarity
     agree: Bool[np.ndarray, "points"]
-    scatter_m: float | None = None
-    """Estimated standard deviation of a coordinate without a stated one, if larger than the default."""
 
 
 def onto_control(
@@ -58,12 +45,10 @@ def onto_control(
     here: Float[np.ndarray, "points 3"],
     sigma_m: Float[np.ndarray, "points"],
     file: str,
-    assumed: Bool[np.ndarray, "points"],
 ) -> OntoControl:
     """Estimate the similarity from `there`, in the frame of a block, to surveyed points `here`.
 
-    `sigma_m`: standard deviations of the differences. The standard deviations of `assumed` points are defaults, which
-    are re-estimated if most of the points contradict them.
+    `sigma_m`: standard deviations of the differences.
 
     Raises InputError for fewer than three points, for collinear points, and if no four points are consistent, with the
     cure if exchanging coordinates would help.
@@ -79,8 +64,6 @@ def onto_control(
             f"{file}: the control points lie on a line, so the rotation about it is undetermined; mark one off the "
             "line, or orient photographs with positions"
         )
-    if best.agree.mean() < _MOST and assumed.any() and (poor := _poor(there, here, sigma_m, assumed)) is not None:
-        return poor
     if len(here) > MIN_POINTS and best.agree.sum() > MIN_POINTS:
         return best
     if best.agree.all() and len(here) == MIN_POINTS:
@@ -93,34 +76,13 @@ def onto_control(
     off = _off(best.similarity, there, here)
     raise InputError(
         f"{file}: the marks of the control points do not fit their coordinates ({np.median(off):.3g} m off in the "
-        "median); check names, system and order of coordinates"
+        "median); check names, system and order of coordinates, and give standard deviations of a less accurate survey"
     )
 
 
 def on_a_line(there: Float[np.ndarray, "points 3"], here: Float[np.ndarray, "points 3"]) -> bool:
     """Return True if all points are collinear, which leaves the rotation about their line undetermined."""
     return next(_of_threes(there, here), None) is None
-
-
-def _poor(there, here, sigma_m, assumed) -> OntoControl | None:
-    """Estimate similarity and accuracy of inaccurate `assumed` points; None if most points remain inconsistent."""
-    n = len(here)
-    if n < _ENOUGH:
-        return None
-    similarity = min(_of_threes(there, here), key=lambda s: np.median(_off(s, there, here)))
-    # Rousseeuw's correction factor for small samples.
-    scatter = (1 + 5 / (n - MIN_POINTS)) * float(np.median(_off(similarity, there, here))) / _MEDIAN
-    for _ in range(5):
-        near = _off(similarity, there, here) < _WITHIN * scatter
-        refined = similarity_between(there[near], here[near])
-        if refined is None or near.sum() <= MIN_POINTS:
-            return None
-        similarity = refined
-        squares = np.sum(_off(similarity, there, here)[near] ** 2)
-        scatter = float(np.sqrt(squares / (3 * near.sum() - _PARAMETERS)))
-    agree = _off(similarity, there, here) < np.where(assumed, _BEYOND * scatter, _tolerance(here, sigma_m))
-    is_poor = agree.mean() >= _MOST and scatter < _POOREST * _size(here)
-    return OntoControl(similarity, agree, scatter) if is_poor else None
 
 
 def _off(similarity: Similarity, there, here) -> Float[np.ndarray, "points"]:
