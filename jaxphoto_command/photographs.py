@@ -58,8 +58,13 @@ def fly(
     from jaxphoto.errors import counted
     from jaxphoto.extras.formats import read_control
     from jaxphoto.extras.photos.features import LONGEST_PX
-    from jaxphoto.extras.photos.matching import match_photographs
-    from jaxphoto.extras.photos.photograph_pairs import MostSimilar, photograph_pairs, usual_choice, usual_count
+    from jaxphoto.extras.photos.matching import (
+        MostSimilar,
+        match_photographs,
+        photograph_pairs,
+        usual_choice,
+        usual_count,
+    )
     from jaxphoto.georeferencing.map_frame import check_heights
     from jaxphoto.georeferencing.recorded_positions import WGS84
     from jaxphoto.io.block_folder import whole_block
@@ -350,8 +355,7 @@ def orient(
     """
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.extras.photos.features import LONGEST_PX
-    from jaxphoto.extras.photos.matching import match_photographs
-    from jaxphoto.extras.photos.photograph_pairs import photograph_pairs, usual_choice
+    from jaxphoto.extras.photos.matching import match_photographs, photograph_pairs, usual_choice
     from jaxphoto.io.block_folder import check_block_target, whole_block
     from jaxphoto.io.block_folder.table_layout import TOML
     from jaxphoto.io.photographs import photographs, sensor_and_interior

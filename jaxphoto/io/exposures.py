@@ -39,8 +39,7 @@ from jaxphoto.georeferencing.datum_change import wgs84_places
 from jaxphoto.georeferencing.gps import LEAP_SECONDS, WEEK_S, Fix, Gps, Heights, gps_seconds, moved
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.georeferencing.recorded_positions import one_height, plausible_positions
-from jaxphoto.io.photograph_metadata import fix_of
-from jaxphoto.io.photographs import Photograph
+from jaxphoto.io.photographs import Photograph, fix_of
 from jaxphoto.io.text_files import read_text
 from jaxphoto.io.text_tables import finite, read_csv
 from jaxphoto.io.trajectory import read_sbet, sbet_records

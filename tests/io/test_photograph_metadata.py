@@ -7,8 +7,7 @@ import pytest
 from PIL import Image
 
 from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, level_from_belly, level_from_gimbal
-from jaxphoto.io.photograph_metadata import drone_record, time_of_exposure, xmp_fields
-from jaxphoto.io.photographs import read_photograph
+from jaxphoto.io.photographs import drone_record, read_photograph, time_of_exposure, xmp_fields
 
 DJI = """<rdf:Description rdf:about="DJI Meta Data" drone-dji:GpsStatus="RTK" drone-dji:AltitudeType="RtkAlt"
  drone-dji:GpsLatitude="22.6939917" drone-dji:AbsoluteAltitude="+139.231" drone-dji:RelativeAltitude="+80.012"

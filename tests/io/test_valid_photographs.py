@@ -7,8 +7,14 @@ import pytest
 from PIL import Image
 
 from jaxphoto.errors import InputError
-from jaxphoto.io.photograph_metadata import drone_record, xmp_fields
-from jaxphoto.io.photographs import photographs, skipped_messages, skipped_subfolders, valid_photographs
+from jaxphoto.io.photographs import (
+    drone_record,
+    photographs,
+    skipped_messages,
+    skipped_subfolders,
+    valid_photographs,
+    xmp_fields,
+)
 
 PACKET = """<?xpacket begin="" id="W5M0MpCehiHzreSzNTczkc9d"?><x:xmpmeta xmlns:x="adobe:ns:meta/"><rdf:RDF>
 <rdf:Description xmlns:drone-dji="http://www.dji.com/drone-dji/1.0/" drone-dji:AbsoluteAltitude="+129.52"

@@ -9,8 +9,7 @@ import pytest
 
 from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.features import FEATURES, OF_FEW
-from jaxphoto.extras.photos.matching import match_photographs
-from jaxphoto.extras.photos.photograph_pairs import nearest_pairs, photograph_pairs
+from jaxphoto.extras.photos.matching import match_photographs, nearest_pairs, photograph_pairs
 from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.initial.matches import PairMatches, connected_images
 from jaxphoto.io.photographs import photographs, sensor_and_interior

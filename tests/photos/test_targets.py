@@ -9,7 +9,7 @@ from jaxphoto.extras.photos.targets import find_targets, read_board, rendered
 from jaxphoto.extras.photos.targets.circles import elliptic_blobs, fit_discs
 from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.io.photographs import photographs
-from jaxphoto.procedures.calibration.target_block import projections
+from jaxphoto.procedures.calibration.start import projections
 from jaxphoto.procedures.calibration.target_calibration import eccentricities
 
 SENSOR = Sensor(480, 360, 0.008)

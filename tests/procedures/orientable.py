@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.initial.matches import PairMatches
+from jaxphoto.procedures.orientation.blocks import similarity_between
 from jaxphoto.procedures.orientation.colmap import Network
-from jaxphoto.procedures.orientation.known_frame import similarity_between
 from jaxphoto.procedures.orientation.orient_photographs import network_block
 from jaxphoto.statistics import covariance
 from tests.formulas import camera_from_object

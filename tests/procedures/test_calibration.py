@@ -15,8 +15,7 @@ from jaxphoto.procedures.calibration import (
     free_parameters,
     target_calibration,
 )
-from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion
-from jaxphoto.procedures.calibration.target_block import projections
+from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion, projections
 from jaxphoto.procedures.calibration.target_calibration import added_sigma, eccentricities
 from jaxphoto.report.target_calibration import findings
 from tests.derivatives import compiled

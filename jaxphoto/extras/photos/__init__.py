@@ -1,8 +1,7 @@
 """Image measurement by OpenCV, COLMAP and least squares: board targets, features, matches."""
 
 from jaxphoto.extras.photos.features import SiftFeatures, read_grey, sift_features
-from jaxphoto.extras.photos.matching import MatchedPhotographs, match_photographs
-from jaxphoto.extras.photos.photograph_pairs import photograph_pairs
+from jaxphoto.extras.photos.matching import MatchedPhotographs, match_photographs, photograph_pairs
 from jaxphoto.extras.photos.targets import Targets, find_targets, read_board, rendered
 
 __all__ = [

@@ -25,7 +25,7 @@ from jaxphoto.procedures.control.surveyed import (
     system_of,
 )
 from jaxphoto.procedures.georeference_photographs import utm_of
-from jaxphoto.procedures.orientation.known_frame import Similarity, similarity_between
+from jaxphoto.procedures.orientation.blocks import Similarity, similarity_between
 
 _SAMPLES = 300
 # Tolerance of a point: number of standard deviations plus fraction of the extent of the control.

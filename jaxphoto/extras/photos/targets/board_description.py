@@ -8,9 +8,8 @@ charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50
 from collections.abc import Callable
 
 from jaxphoto.errors import InputError
-from jaxphoto.extras.photos.targets.chessboard import Chessboard
 from jaxphoto.extras.photos.targets.circles import CircleGrid
-from jaxphoto.extras.photos.targets.markers import DICTIONARIES, CharucoBoard
+from jaxphoto.extras.photos.targets.markers import DICTIONARIES, CharucoBoard, Chessboard
 from jaxphoto.extras.photos.targets.pattern import Pattern
 from jaxphoto.io.text_tables import is_number
 
