@@ -338,26 +338,24 @@ def calibrate(
 @command("orient", PANEL, "jaxphoto orient photographs/*.jpg --out BLOCK")
 def orient(
     output: Output,
-    images: Annotated[list[Path], Argument(help="Photographs of one camera, or one block folder.")],
+    images: Annotated[list[Path], Argument(help="Photographs of one camera.")],
     out: opt.BlockOut,
     pairs: opt.Pairs = None,
     features: opt.Features = None,
     longest_px: opt.LongestSide = None,
     c_mm: opt.PrincipalDistance = None,
     pixel_mm: opt.PixelSize = None,
-    model: Annotated[str | None, Option(help="Distortion model, like brown or smac (default: brown).")] = None,
+    model: opt.Distortion = "brown",
     r0_mm: opt.R0 = None,
 ) -> None:
     """Orient photographs by their features, as initial values for `jaxphoto adjust`.
 
-    For a block folder, determine the approximate orientation missing in its images.csv. Exit code 1: results written,
-    but not converged.
+    Exit code 1: results written, but not converged.
     """
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.extras.photos.features import LONGEST_PX
     from jaxphoto.extras.photos.matching import match_photographs, photograph_pairs, usual_choice
     from jaxphoto.io.block_folder import check_block_target, whole_block
-    from jaxphoto.io.block_folder.table_layout import TOML
     from jaxphoto.io.photographs import photographs, sensor_and_interior
     from jaxphoto.io.text_files import read_json
     from jaxphoto.procedures.calibration import distortion_model
@@ -365,18 +363,10 @@ def orient(
     from jaxphoto.report.orientation import print_orientation, write_orientation
 
     check_block_target(out, *images)
-    if len(images) == 1 and (images[0] / TOML).is_file():
-        if any(v is not None for v in (pairs, features, longest_px, c_mm, pixel_mm, model, r0_mm)):
-            raise typer.BadParameter(
-                f"{images[0]} is a block folder with its own image points and cameras: omit the options, or change "
-                "block.toml."
-            )
-        _orient_block(output, images[0], out)
-        return
     with output.progress("reading the photographs") as progress:
         read = photographs(images)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
-        distortion = distortion_model(model or "brown", camera.sensor, r0_mm or 0.0)
+        distortion = distortion_model(model, camera.sensor, r0_mm or 0.0)
         compared = photograph_pairs(read, pairs or usual_choice(read))
         output.say(camera.origin)
         initial = camera.interior
@@ -414,24 +404,6 @@ def orient(
     output.add(**read_json(out / "orientation.json"))
     if not result.report.converged:
         raise typer.Exit(1)
-
-
-def _orient_block(output: Output, folder: Path, out: Path) -> None:
-    """Write the block in `folder` with initial orientations to `out`."""
-    from jaxphoto.errors import InputError
-    from jaxphoto.io import read_block, write_block
-    from jaxphoto.procedures.adjust import needs_orientation
-    from jaxphoto.procedures.orientation import orient_block
-
-    with output.progress("reading the block") as progress:
-        block = read_block(folder)
-        if not needs_orientation(block):
-            raise InputError(f"{folder} needs no orientation: resection orients all images; adjust it directly")
-        oriented = orient_block(block, progress.update)
-        write_block(oriented, out)
-    n_images, n_oriented = len(block.images), int(sum(oriented.start.image_known))
-    output.wrote(out, f"{n_oriented} of {n_images} images oriented; wrote {out}")
-    output.add(n_images=n_images, n_oriented=n_oriented)
 
 
 def map_codes(text: str | None) -> tuple[int | None, int | None]:
