@@ -427,7 +427,7 @@ def map_codes(text: str | None) -> tuple[int | None, int | None]:
 
 def height_reference(text: str | None) -> Any:
     """Return the height reference, or the EPSG code of the height system."""
-    from jaxphoto.georeferencing.gps import Heights
+    from jaxphoto.georeferencing.recorded_positions import Heights
 
     if text is None or (text in get_args(Heights) and text != "unknown"):
         return text

@@ -36,9 +36,18 @@ from jaxphoto.georeferencing.camera_attitude import (
     level_from_body,
 )
 from jaxphoto.georeferencing.datum_change import wgs84_places
-from jaxphoto.georeferencing.gps import LEAP_SECONDS, WEEK_S, Fix, Gps, Heights, gps_seconds, moved
 from jaxphoto.georeferencing.map_frame import MapFrame
-from jaxphoto.georeferencing.recorded_positions import one_height, plausible_positions
+from jaxphoto.georeferencing.recorded_positions import (
+    LEAP_SECONDS,
+    WEEK_S,
+    Fix,
+    Gps,
+    Heights,
+    gps_seconds,
+    moved,
+    one_height,
+    plausible_positions,
+)
 from jaxphoto.io.photographs import Photograph, fix_of
 from jaxphoto.io.text_files import read_text
 from jaxphoto.io.text_tables import finite, read_csv

@@ -34,7 +34,7 @@ from jaxphoto.camera import AbstractDistortion, InteriorOrientation, Sensor
 from jaxphoto.camera.lens_prior import lens_prior
 from jaxphoto.errors import InputError, counted, few
 from jaxphoto.georeferencing.camera_attitude import USUAL_SIGMA_DEG, CameraAttitude, level_from_belly, level_from_gimbal
-from jaxphoto.georeferencing.gps import Fix, Gps, Heights, Taken, gps_seconds
+from jaxphoto.georeferencing.recorded_positions import Fix, Gps, Heights, Taken, gps_seconds
 from jaxphoto.procedures.known_lens import KnownLens
 from jaxphoto.writing import MARKER, input_file
 

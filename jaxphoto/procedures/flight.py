@@ -10,11 +10,11 @@ from jaxphoto.adjustment import MINIMAL_SIZES, Adjustment
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import BlockError, DatumError, GroupsError, InputError, JaxphotoError, RankError, few
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
-from jaxphoto.georeferencing.gps import Gps
+from jaxphoto.georeferencing.recorded_positions import Gps
 from jaxphoto.initial.matches import MatchedPart
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control import ControlledBlock, control_block, retest
-from jaxphoto.procedures.control.frame import new_code, stated_system
+from jaxphoto.procedures.control.control_block import new_code, stated_system
 from jaxphoto.procedures.control.marks import images_of
 from jaxphoto.procedures.control.surveyed import GivenControl, check_near
 from jaxphoto.procedures.georeference_photographs import (

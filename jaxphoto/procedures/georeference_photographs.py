@@ -29,8 +29,8 @@ from jaxphoto.errors import InputError, counted, few
 from jaxphoto.georeferencing import Mount
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.datum_change import datum_change
-from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame, map_name
+from jaxphoto.georeferencing.recorded_positions import Gps
 from jaxphoto.initial.quaternions import average_rotation
 from jaxphoto.initial.rays import padded, padded_length
 from jaxphoto.least_squares import least_squares

@@ -11,9 +11,8 @@ from pyproj import datadir
 
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import map_frame
-from jaxphoto.georeferencing.gps import Gps
-from jaxphoto.georeferencing.recorded_positions import one_height
-from jaxphoto.procedures.control.frame import in_frame
+from jaxphoto.georeferencing.recorded_positions import Gps, one_height
+from jaxphoto.procedures.control.control_block import in_frame
 from jaxphoto.procedures.georeference_photographs import georeference_photographs
 from jaxphoto_command.photographs import height_reference
 from tests.procedures.controlled import CODE, marked_block

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from pyproj import Geod
 
-from jaxphoto.georeferencing.gps import Gps, moved
-from jaxphoto.georeferencing.recorded_positions import one_height, plausible_positions
+from jaxphoto.georeferencing.recorded_positions import Gps, moved, one_height, plausible_positions
 
 HERE = Gps(-15.75, -47.9, 1100.0)
 

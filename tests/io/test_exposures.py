@@ -12,8 +12,8 @@ from PIL import Image
 
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude, level_from_belly
-from jaxphoto.georeferencing.gps import FIX_SIGMA_M, LEAP_SECONDS, WEEK_S, Gps, Taken, moved
 from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.georeferencing.recorded_positions import FIX_SIGMA_M, LEAP_SECONDS, WEEK_S, Gps, Taken, moved
 from jaxphoto.io.exposures import located, read_exposures, with_exposures
 from jaxphoto.io.photographs import Photograph, valid_photographs
 from jaxphoto.io.trajectory import write_sbet

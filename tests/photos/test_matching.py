@@ -10,7 +10,7 @@ import pytest
 from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.features import FEATURES, OF_FEW
 from jaxphoto.extras.photos.matching import match_photographs, nearest_pairs, photograph_pairs
-from jaxphoto.georeferencing.gps import Gps
+from jaxphoto.georeferencing.recorded_positions import Gps
 from jaxphoto.initial.matches import PairMatches, connected_images
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from tests.photos.ground import C_MM, SENSOR, mapped, photograph, texture

@@ -5,7 +5,7 @@ import pytest
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing.gps import Gps
+from jaxphoto.georeferencing.recorded_positions import Gps
 from jaxphoto.initial.matches import MatchedPart
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight, flight_control

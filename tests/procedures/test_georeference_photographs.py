@@ -11,8 +11,8 @@ from scipy.spatial.transform import Rotation
 from jaxphoto import adjust, covariance
 from jaxphoto.errors import DatumError, InputError
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
-from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame
+from jaxphoto.georeferencing.recorded_positions import Gps
 from jaxphoto.procedures.georeference_photographs import (
     SIGMA_M,
     georeference_photographs,
