@@ -23,6 +23,10 @@ _ANGLES_DEG = (1.5, 0.4)
 _PLAUSIBLE = 1.5
 # Minimum inlier ratio of a pair: fewer matches agree by chance.
 _MIN_INLIER_RATIO = 0.25
+
+
+# Maximum misclosure (px) of two images that differ by a rotation only.
+_ROTATED_PX = 2.0
 _ONE_PLACE = "they were taken from one place, or see too few points at a wide enough angle"
 
 
@@ -102,6 +106,9 @@ def map_images(
         two_view.ransac.random_seed, two_view.detect_watermark = 0, False
         pycolmap.geometric_verification(database, two_view_geometry_options=two_view)
         verified = _verified_matches(pycolmap, database)
+        rays = [_rays(cameras[k], xy) for k, xy in zip(image_camera, features_px, strict=True)]
+        if verified and all(_only_rotated(rays, match, cameras[0].c_px) for match in verified):
+            raise BlockError(_no_pair(len(names), _ONE_PLACE))
         _check_connected(names, verified)
         best, score = None, (False, 0, 0)
         wanted = len({image for m in verified for image in (m.first, m.second)})
@@ -132,6 +139,21 @@ def _verified_matches(pycolmap: Any, database: str) -> tuple[PairMatches, ...]:
             if len(features):
                 verified.append(PairMatches(one, other, features))
     return tuple(sorted(verified, key=lambda m: m[:2]))
+
+
+def _rays(camera: MappedCamera, xy_px: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n 3"]:
+    """Return unit directions of ideal coordinates, in COLMAP's camera frame."""
+    xy = (xy_px - np.array([camera.width_px, camera.height_px]) / 2) / camera.c_px
+    rays = np.column_stack([xy, np.ones(len(xy))])
+    return rays / np.linalg.norm(rays, axis=1, keepdims=True)
+
+
+def _only_rotated(rays: list[np.ndarray], match: PairMatches, c_px: float) -> bool:
+    """Return True if a rotation maps the rays of one image to the other: both images have one projection centre."""
+    one, other = rays[match.first][match.features[:, 0]], rays[match.second][match.features[:, 1]]
+    u, _, vt = np.linalg.svd(one.T @ other)
+    turned = one @ (u * [1.0, 1.0, np.sign(np.linalg.det(u @ vt))]) @ vt
+    return float(np.median(np.linalg.norm(turned - other, axis=1))) < _ROTATED_PX / c_px
 
 
 def _no_pair(n_images: int, why: str) -> str:
