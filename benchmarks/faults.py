@@ -98,11 +98,6 @@ class Tried:
             self.whole = _digests(place / case.out)
             _remove(place / case.out)
 
-    @property
-    def kept(self) -> str:
-        """What a run that did not end has worked out so far, beside its place, for the next one to go on from."""
-        return f"{self.case.out}.progress"
-
     def words(self, place: Path) -> list[str]:
         """The command line of a run that writes below `place`."""
         return [self.name, *self.case.arguments, "--out", str(place / self.case.out)]
@@ -147,7 +142,7 @@ class Tried:
                 code = _ended(self.start(disk))
                 self.count("read-only disks" if read_only else "full disks")
                 here = f"on a {'read-only disk' if read_only else f'disk of {room} bytes'}"
-                left = _names(disk) - {self.kept}
+                left = _names(disk)
                 if code == 0:
                     yield from self.judged(disk, here, must_be=True)
                 elif code != 2 or (left and self.name not in _GOES_ON):
@@ -172,7 +167,7 @@ class Tried:
 
         out = place / self.case.out
         others = {name for name in _names(place) if not is_place(name)} - {self.case.out}
-        if others := others - ({self.kept} if not finished else set()):
+        if others:
             yield f"{when}: {sorted(others)} left"
         if not out.exists():
             if must_be and self.name not in _GOES_ON:

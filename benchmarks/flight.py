@@ -102,8 +102,7 @@ def ours(arguments: argparse.Namespace) -> dict:
     clock = _Clock()
     import jaxphoto  # noqa: F401
     from jaxphoto.camera import InteriorOrientation
-    from jaxphoto.extras.photos.matching import match_photographs
-    from jaxphoto.extras.photos.photograph_pairs import photograph_pairs
+    from jaxphoto.extras.photos.matching import match_photographs, photograph_pairs
     from jaxphoto.io.photographs import known_lens, sensor_and_interior, valid_photographs
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight

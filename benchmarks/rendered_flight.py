@@ -192,7 +192,7 @@ def write_truth(flight: Flight, folder: Path) -> None:
 
 def judge(folder: Path, results: Path) -> int:
     """Interior orientation in standard deviations, and positions after a similarity, against the truth."""
-    from jaxphoto.procedures.orientation.known_frame import similarity_between
+    from jaxphoto.procedures.orientation.blocks import similarity_between
 
     truth = json.loads((folder / "truth.json").read_text())
     (sensor,) = tomllib.loads((results / "block" / "block.toml").read_text())["cameras"].values()

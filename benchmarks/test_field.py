@@ -27,7 +27,7 @@ from jaxphoto.block import Block
 from jaxphoto.camera import Brown, InteriorOrientation, OpenCv, Sensor
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.procedures.calibration import CAMERA, Board, Detection, TargetRows, calibration_block
-from jaxphoto.procedures.calibration.target_block import resected
+from jaxphoto.procedures.calibration.start import resected
 from jaxphoto.rotation import small_rotation
 
 SENSOR, SPACING_M, SIDE = Sensor(6016, 4016, 0.006), 0.077, 10

@@ -91,10 +91,6 @@ ControlSystem = Annotated[
 MapSystem = Annotated[
     str | None, Option(help="Map system of the block: EPSG code, or with heights 25832+7837 (default: UTM zone).")
 ]
-Targets = Annotated[
-    str | None,
-    Option(help="Targets to find at the points: circle:diameter_mm=300, aruco:dictionary=4X4_50, cross:side_mm=600."),
-]
 
 Cloud = Annotated[Path, Argument(help="Point cloud: .las, .laz or .csv (docs/clouds.md).")]
 Classes = Annotated[str | None, Option("--class", help="Classes to use, comma-separated: 2,6.")]

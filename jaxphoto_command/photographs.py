@@ -1,12 +1,11 @@
 """Commands that start from photographs."""
 
 import time
-from contextlib import ExitStack
 from functools import partial
 from itertools import count
 from pathlib import Path
 from threading import Thread
-from typing import Annotated, Any, Literal, get_args
+from typing import Annotated, Any, get_args
 
 import typer
 from typer import Argument, Option
@@ -48,7 +47,6 @@ def fly(
     control: Annotated[Path | None, Option(help=f"Surveyed points: {_CONTROL}.")] = None,
     marks: opt.ControlMarks = None,
     control_epsg: opt.ControlSystem = None,
-    targets: opt.Targets = None,
 ) -> None:
     """Calibrate the camera of a flight from its photographs and their positions: orient, georeference, adjust, assess.
 
@@ -58,16 +56,18 @@ def fly(
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.errors import counted
     from jaxphoto.extras.formats import read_control
-    from jaxphoto.extras.photos.control_targets import make_target_search
     from jaxphoto.extras.photos.features import LONGEST_PX
-    from jaxphoto.extras.photos.matching import match_photographs
-    from jaxphoto.extras.photos.photograph_pairs import MostSimilar, photograph_pairs, usual_choice, usual_count
-    from jaxphoto.extras.photos.targets.on_ground import read_target
+    from jaxphoto.extras.photos.matching import (
+        MostSimilar,
+        match_photographs,
+        photograph_pairs,
+        usual_choice,
+        usual_count,
+    )
     from jaxphoto.georeferencing.map_frame import check_heights
     from jaxphoto.georeferencing.recorded_positions import WGS84
     from jaxphoto.io.block_folder import whole_block
     from jaxphoto.io.exposures import exposure_files, located
-    from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
     from jaxphoto.io.photographs import (
         known_lens,
         sensor_and_interior,
@@ -77,26 +77,24 @@ def fly(
     )
     from jaxphoto.io.result_folder import write_photograph_files
     from jaxphoto.procedures.calibration import distortion_model
-    from jaxphoto.procedures.control.of_flight import flight_control
-    from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
+    from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight, flight_control
     from jaxphoto.report import prepare_pictures
     from jaxphoto.report.flight import FlightSource, camera_sentences, part_folder, report_of, write_flight
     from jaxphoto.report.photographs import write_orientation
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.certificate import Provenance, certify
 
-    if control is None and (marks or control_epsg or targets):
-        raise typer.BadParameter("--marks, --control-epsg and --targets need --control FILE.")
+    if control is None and (marks or control_epsg):
+        raise typer.BadParameter("--marks and --control-epsg need --control FILE.")
     control_files = [path for path in (control, marks) if path]
     check_folder(out, *photographs, *control_files, *(exposures or ()))
-    surveyed, target = read_control(control, marks) if control else None, read_target(targets) if targets else None
-    check_pieces(beside(out))
+    surveyed = read_control(control, marks) if control else None
     code, vertical = map_codes(epsg)
     reference, arm = height_reference(heights), _lever_arm(lever_arm)
     if isinstance(reference, int):
         check_heights(WGS84, reference)
     Thread(target=prepare_pictures, daemon=True).start()
-    with output.progress("reading the photographs") as progress, ExitStack() as stack:
+    with output.progress("reading the photographs") as progress:
         read, corrupt = valid_photographs(photographs)
         for text in (*skipped_messages(corrupt), *skipped_subfolders(photographs).values()):
             output.warn(f"skipped: {text}")
@@ -105,16 +103,14 @@ def fly(
         output.say(*positions.sentences)
         points = None
         if surveyed:
-            finder = make_target_search(target, {p.name: p.path for p in read}) if target else None
             stations = [p.name for p in read], [p.gps for p in read]
-            points, code = flight_control(surveyed, control_epsg, *stations, finder, code)
+            points, code = flight_control(surveyed, control_epsg, *stations, code)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
         distortion = distortion_model(model, camera.sensor)
         choice, number = pairs or usual_choice(read), features or usual_count(len(read))
         compared = photograph_pairs(read, choice)
         matches = "pairs by similarity" if isinstance(compared, MostSimilar) else counted(len(compared), "pair")
         output.say(camera.origin, f"{counted(len(read), 'photograph')}, {matches} to match")
-        checkpoint = stack.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
             read,
             camera.sensor,
@@ -123,7 +119,6 @@ def fly(
             count=number,
             longest_px=longest_px or LONGEST_PX,
             in_parts=True,
-            keep=checkpoint,
             progress=progress.steps,
         )
         initial = camera.interior
@@ -140,7 +135,6 @@ def fly(
                 None if no_lens_prior else known_lens(read, camera, distortion),
                 taken if rolling_shutter else None,
                 vertical,
-                sorted(taken, key=lambda name: taken[name][0]) if len(taken) == len(read) else (),
             ),
             progress.update,
         )
@@ -173,7 +167,6 @@ def fly(
                     write_orientation(part.oriented, folder, **matching)
                     write_provenance(part, folder)
             no_certificate = certify(work)
-        checkpoint.remove()
     for k, (part, page) in enumerate(zip(flight.parts, reports, strict=True), 1):
         report = part.oriented.report
         size = f"{len(report.order)} photographs, {report.n_image_points} image points, {report.mean_px:.2f} px"
@@ -197,10 +190,6 @@ def control(
     out: opt.Out,
     marks: opt.ControlMarks = None,
     control_epsg: opt.ControlSystem = None,
-    targets: opt.Targets = None,
-    photographs: Annotated[
-        list[Path] | None, Option(help="Folder of the block's photographs, to find targets.")
-    ] = None,
     epsg: opt.MapSystem = None,
 ) -> None:
     """Adjust an oriented block with surveyed points and their image measurements.
@@ -209,13 +198,10 @@ def control(
     1: results written, but the verdict is red.
     """
     from jaxphoto.extras.formats import read_control
-    from jaxphoto.extras.photos.control_targets import make_target_search
-    from jaxphoto.extras.photos.targets.on_ground import read_target
     from jaxphoto.io import read_block
     from jaxphoto.io.block_folder import whole_block
-    from jaxphoto.io.photographs import skipped_messages, valid_photographs
     from jaxphoto.procedures.adjust import adjust
-    from jaxphoto.procedures.control import at_optimum, control_block, control_block_with_targets
+    from jaxphoto.procedures.control import at_optimum, control_block
     from jaxphoto.report import Tables, verdict_of
     from jaxphoto.report.findings import Verdict
     from jaxphoto.report.page import versions
@@ -226,27 +212,15 @@ def control(
 
     files = [path for path in (file, marks) if path]
     check_folder(out, block, *files)
-    if (targets is None) != (not photographs):
-        raise typer.BadParameter("Give both --targets and --photographs, or neither.")
-    target, (code, vertical) = read_target(targets) if targets else None, map_codes(epsg)
+    code, vertical = map_codes(epsg)
     with output.progress("reading") as progress:
         points, read = read_control(file, marks), read_block(block)
         progress.update("adjusting the block")
         oriented = at_optimum(adjust(read))
-        valid, corrupt = valid_photographs(photographs) if photographs else ([], {})
-        paths = {p.name: p.path for p in valid}
-        provenance = Provenance.of_block(block, files, list(paths.values()))
-        options: dict[str, Any] = {
-            "system": control_epsg,
-            "code": code,
-            "vertical": vertical,
-            "report": progress.update,
-        }
-        if target:
-            finder = make_target_search(target, paths, progress.update)
-            result = control_block_with_targets(oriented, points, finder, **options)
-        else:
-            result = control_block(oriented, points, **options)
+        provenance = Provenance.of_block(block, files, [])
+        result = control_block(
+            oriented, points, system=control_epsg, code=code, vertical=vertical, report=progress.update
+        )
         progress.update("computing statistics")
         tables, adjusted = Tables(result.adjusted), result.adjusted
         verdict = Verdict.of([*verdict_of(tables).findings, *control_findings(result)])
@@ -262,8 +236,6 @@ def control(
             write_summary({**verdict.summary, **control_summary(result), "versions": versions()}, work)
             with whole_block(adjusted.block, work / "block") as folder:
                 provenance.write(images, folder)
-    for text in skipped_messages(corrupt):
-        output.warn(f"skipped in the search for targets: {text}")
     output.say(*result.sentences, verdict.headline)
     for finding in verdict.findings:
         if finding.severity != "note" or finding.code == "check_points":
@@ -278,8 +250,7 @@ def control(
     PANEL,
     "jaxphoto calibrate board/*.jpg --board chessboard:8x6:square_mm=30 --out camera",
     "Boards: chessboard:8x6:square_mm=30, circles:4x11:spacing_mm=20:diameter_mm=15, "
-    "aruco:5x7:marker_mm=30:gap_mm=6:dictionary=4X4_50, "
-    "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50, targets:FILE.csv.",
+    "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50.",
 )
 def calibrate(
     output: Output,
@@ -359,28 +330,24 @@ def calibrate(
 @command("orient", PANEL, "jaxphoto orient photographs/*.jpg --out BLOCK")
 def orient(
     output: Output,
-    images: Annotated[list[Path], Argument(help="Photographs of one camera, or one block folder.")],
+    images: Annotated[list[Path], Argument(help="Photographs of one camera.")],
     out: opt.BlockOut,
     pairs: opt.Pairs = None,
     features: opt.Features = None,
     longest_px: opt.LongestSide = None,
     c_mm: opt.PrincipalDistance = None,
     pixel_mm: opt.PixelSize = None,
-    model: Annotated[str | None, Option(help="Distortion model, like brown or smac (default: brown).")] = None,
+    model: opt.Distortion = "brown",
     r0_mm: opt.R0 = None,
 ) -> None:
     """Orient photographs by their features, as initial values for `jaxphoto adjust`.
 
-    For a block folder, determine the approximate orientation missing in its images.csv. Exit code 1: results written,
-    but not converged.
+    Exit code 1: results written, but not converged.
     """
     from jaxphoto.camera import InteriorOrientation
     from jaxphoto.extras.photos.features import LONGEST_PX
-    from jaxphoto.extras.photos.matching import match_photographs
-    from jaxphoto.extras.photos.photograph_pairs import photograph_pairs, usual_choice
+    from jaxphoto.extras.photos.matching import match_photographs, photograph_pairs, usual_choice
     from jaxphoto.io.block_folder import whole_block
-    from jaxphoto.io.block_folder.table_layout import TOML
-    from jaxphoto.io.kept_pieces import KeptPieces, beside, check_pieces
     from jaxphoto.io.photographs import photographs, sensor_and_interior
     from jaxphoto.io.text_files import read_json
     from jaxphoto.procedures.calibration import distortion_model
@@ -389,32 +356,13 @@ def orient(
     from jaxphoto.writing import check_folder
 
     check_folder(out, *images)
-    if len(images) == 1 and (images[0] / TOML).is_file():
-        values = {
-            "pairs": pairs,
-            "features": features,
-            "longest-px": longest_px,
-            "c-mm": c_mm,
-            "pixel-mm": pixel_mm,
-            "model": model,
-            "r0-mm": r0_mm,
-        }
-        if names := [f"--{name}" for name, value in values.items() if value is not None]:
-            raise typer.BadParameter(
-                f"{images[0]} is a block folder with its own image points and cameras: omit {', '.join(names)}, or "
-                "change block.toml."
-            )
-        _orient_block(output, images[0], out)
-        return
-    check_pieces(beside(out))
-    with output.progress("reading the photographs") as progress, ExitStack() as stack:
+    with output.progress("reading the photographs") as progress:
         read = photographs(images)
         camera = sensor_and_interior(read, pixel_mm, c_mm)
-        distortion = distortion_model(model or "brown", camera.sensor, r0_mm or 0.0)
+        distortion = distortion_model(model, camera.sensor, r0_mm or 0.0)
         compared = photograph_pairs(read, pairs or usual_choice(read))
         output.say(camera.origin)
         initial = camera.interior
-        checkpoint = stack.enter_context(KeptPieces(beside(out)).alone())
         matched = match_photographs(
             read,
             camera.sensor,
@@ -422,7 +370,6 @@ def orient(
             compared,
             count=features,
             longest_px=longest_px or LONGEST_PX,
-            keep=checkpoint,
             progress=progress.steps,
         )
         result = orient(
@@ -441,7 +388,6 @@ def orient(
         progress.update(f"writing {out}")
         with whole_block(result.block, out) as folder:
             write_orientation(result, folder, n_gross=matched.n_gross, sigma_factor=matched.sigma_factor)
-        checkpoint.remove()
     output.say(
         f"{matched.n_gross} matches rejected before orientation (off the epipolar line, or in pairs with too few); "
         f"sigma factor of the others {matched.sigma_factor:.2g}"
@@ -450,62 +396,6 @@ def orient(
     output.wrote(out, f"wrote {out}: adjust it with jaxphoto adjust {out} --out DIR")
     output.add(**read_json(out / "orientation.json"))
     if not result.report.converged:
-        raise typer.Exit(1)
-
-
-def _orient_block(output: Output, folder: Path, out: Path) -> None:
-    """Write the block in `folder` with initial orientations to `out`."""
-    from jaxphoto.errors import InputError
-    from jaxphoto.io import read_block, write_block
-    from jaxphoto.procedures.adjust import needs_orientation
-    from jaxphoto.procedures.orientation import orient_block
-
-    with output.progress("reading the block") as progress:
-        block = read_block(folder)
-        if not needs_orientation(block):
-            raise InputError(f"{folder} needs no orientation: resection orients all images; adjust it directly")
-        oriented = orient_block(block, progress.update)
-        write_block(oriented, out)
-    n_images, n_oriented = len(block.images), int(sum(oriented.start.image_known))
-    output.wrote(out, f"{n_oriented} of {n_images} images oriented; wrote {out}")
-    output.add(n_images=n_images, n_oriented=n_oriented)
-
-
-@command("undistort", PANEL, "jaxphoto undistort photographs --camera results --out straight")
-def undistort(
-    output: Output,
-    photographs: opt.Photographs,
-    camera: Annotated[Path, Option(help="Results, block, COLMAP model or camera file.")],
-    out: Annotated[Path, Option(help="Output folder for the photographs and their camera.toml.")],
-    which: opt.Camera = None,
-    keep: Annotated[
-        Literal["crop", "all"], Option(help="crop: without black borders; all: whole image with black borders.")
-    ] = "crop",
-) -> None:
-    """Resample photographs to a camera without distortion.
-
-    Exit code 1: results written, but some photographs were skipped.
-    """
-    from jaxphoto.io.camera_files import read_camera_file
-    from jaxphoto.io.photographs import skipped_messages, skipped_subfolders, valid_photographs
-    from jaxphoto.io.undistorted import write_undistorted
-    from jaxphoto.writing import check_folder
-
-    check_folder(out, camera, *photographs)
-    with output.progress("reading the photographs") as progress:
-        file = read_camera_file(camera, camera=which)
-        read, corrupt = valid_photographs(photographs)
-        written = write_undistorted(read, file, out, keep, progress=partial(progress.steps, "undistorting"))
-    skipped = corrupt | written.left_out
-    for text in (*skipped_messages(skipped), *skipped_subfolders(photographs).values()):
-        output.warn(f"skipped: {text}")
-    sensor, interior = written.camera
-    n, c_px = len(read) - len(written.left_out), float(interior.c) / sensor.pixel_mm
-    output.say(f"{n} photographs of {sensor.width_px} x {sensor.height_px} pixels, c = {c_px:.6g} pixels")
-    output.wrote(out, f"wrote {out}")
-    size = {"width_px": sensor.width_px, "height_px": sensor.height_px}
-    output.add(n_photographs=n, **size, c_px=c_px, left_out=list(skipped))
-    if skipped:
         raise typer.Exit(1)
 
 
@@ -530,7 +420,7 @@ def map_codes(text: str | None) -> tuple[int | None, int | None]:
 
 def height_reference(text: str | None) -> Any:
     """Return the height reference, or the EPSG code of the height system."""
-    from jaxphoto.georeferencing.gps import Heights
+    from jaxphoto.georeferencing.recorded_positions import Heights
 
     if text is None or (text in get_args(Heights) and text != "unknown"):
         return text

@@ -50,19 +50,3 @@ image,X_m,Y_m,Z_m,omega_deg,phi_deg,kappa_deg,sigma_X_m,sigma_Y_m,sigma_Z_m,sigm
 a.JPG,500010.5,6170000.25,120.5,1.5,-2.25,91,0.02,0.02,0.04,0.1,0.1,0.5,fixed
 b.JPG,500030.5,6170000.75,120.75,0.5,-1.25,90,,,,,,,
 """
-POSPAC_HEAD = """***
- POS Export Utility
- Copyright (C) 1997-2018 by Applanix Corporation      [May 17 2018]
-***
-
- Mission Start Time:
-   Date of Mission: 2018-08-07
- Mapping frame datum: WGS84  ; Mapping frame projection : UTM;
- central meridian = 15.000000 deg;
- latitude of the grid origin = 0.000000 deg; grid scale factor = 0.999600:
- false easting = 500000.000000 m; false northing = 0.000000 m;
- First rotation is around the 'x' by 'omega' angle.
- Lever arm values: lx =        0.0000 m, ly =        0.0000 m, lz =        0.0000 m.
- ID, # EVENT, TIME (s), EASTING, NORTHING, ELLIPSOID HEIGHT, OMEGA, PHI, KAPPA, LAT, LONG
-( time in Sec, position in Meters, orientation and lat/long in Degrees )
-"""

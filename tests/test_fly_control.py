@@ -1,4 +1,4 @@
-"""`jaxphoto fly` with control: circles found in rendered photographs, whose positions are 20 m too high."""
+"""`jaxphoto fly` with control measured in rendered photographs, whose positions are 20 m too high."""
 
 import hashlib
 import json
@@ -10,10 +10,15 @@ import pytest
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io import read_block
 from tests.commands import run
-from tests.photos.ground import photograph, texture
+from tests.photos.ground import SENSOR, mapped, photograph, texture
 from tests.procedures.controlled import CODE, ORIGIN
-from tests.procedures.test_control_targets import FIRST_M, SURVEYED, painted
 from tests.test_fly_command import C_MM, PIXEL_MM, with_position
+
+SURVEYED = np.array(
+    [[-22.13, -17.31], [24.4, -15.87], [1.27, 2.33], [-20.2, 18.61], [21.05, 19.44], [9.31, -8.2], [-9.45, 9.06]]
+)
+FIRST_M = 30.0
+"""Height of the ground above the ellipsoid by the survey; the receivers say 20 m more, and 1.5 m east."""
 
 
 @pytest.fixture(scope="module")
@@ -23,11 +28,14 @@ def flown(tmp_path_factory):
     (folder / "photographs").mkdir()
     frame = MapFrame(CODE, None, ORIGIN)
     ground = 0.7 * texture(rng, 2400).astype(np.float32) + 40
-    painted(ground, "circle")
+    marks = []
     for k in range(12):
         at = np.array([14.0 * (k % 4) - 21, 14.0 * (k // 4) - 14, 60.0 + 8 * (k % 3)])
         path = folder / "photographs" / f"a{k:02}.png"
-        photograph(path, ground, at, (*rng.uniform(-14, 14, 2), 90.0 * (k % 4)), rng)
+        matrix = photograph(path, ground, at, (*rng.uniform(-14, 14, 2), 90.0 * (k % 4)), rng)
+        for p, xy in enumerate(mapped(matrix, SURVEYED) + 0.5):
+            if (xy > 3).all() and (xy < (SENSOR.width_px - 3, SENSOR.height_px - 3)).all():
+                marks.append((f"a{k:02}.jpg", f"P{p}", *(xy + rng.normal(0, 0.1, 2)), 0.1))
         recorded = at + rng.normal(0, 0.03, 3) + [1.5, 0, FIRST_M + 20.0]
         with_position(path, frame.place(frame.map(recorded[None]))[0])
     xyz = np.column_stack([SURVEYED, np.full(len(SURVEYED), FIRST_M)]) + rng.normal(0, 0.01, (len(SURVEYED), 3))
@@ -36,16 +44,18 @@ def flown(tmp_path_factory):
     table["sigma_X_m"] = 0.01
     table["role"] = ["control"] * 5 + ["check"] * 2
     table.to_csv(folder / "survey.csv", index=False)
+    names = ["image", "point", "x_px", "y_px", "sigma_px"]
+    pd.DataFrame(marks, columns=names).to_csv(folder / "marks.csv", index=False)
     return folder
 
 
 @pytest.mark.slow
-def test_a_flight_is_brought_onto_targets_that_it_finds(flown, tmp_path, monkeypatch, capsys):
+def test_a_flight_is_brought_onto_its_control(flown, tmp_path, monkeypatch, capsys):
     out = tmp_path / "out"
     given = ("--c-mm", 3.7, "--pixel-mm", PIXEL_MM, "--features", 500, "--control", flown / "survey.csv")
-    told = ("--control-epsg", CODE, "--targets", "circle:diameter_mm=1600")
+    told = ("--control-epsg", CODE, "--marks", flown / "marks.csv")
     _, said, wrong = run(monkeypatch, capsys, "fly", flown / "photographs", "--out", out, *given, *told)
-    assert "P6 in " in said, said + wrong
+    assert "control points bring the block to their frame" in said, said + wrong
     summary = json.loads((out / "summary.json").read_text())["parts"][0]
     assert summary["epsg"] == CODE and summary["control"]["control"]["points"] == 5, summary
     points = pd.read_csv(out / "result" / "surveyed_points.csv")
@@ -59,25 +69,24 @@ def test_a_flight_is_brought_onto_targets_that_it_finds(flown, tmp_path, monkeyp
     assert "P6" in (out / "report.html").read_text()
     # What was read besides photographs is among the inputs, and options among what the certificate tells.
     inputs = pd.read_csv(out / "result" / "inputs.csv").set_index("file")["sha256"]
-    assert inputs["survey.csv"] == hashlib.sha256((flown / "survey.csv").read_bytes()).hexdigest() and len(inputs) == 13
-    assert "circle:diameter_mm=1600" in (out / "certificate.html").read_text()
+    assert inputs["survey.csv"] == hashlib.sha256((flown / "survey.csv").read_bytes()).hexdigest() and len(inputs) == 14
+    assert "marks.csv" in (out / "certificate.html").read_text()
 
 
 @pytest.mark.parametrize(
     ("change", "options", "message"),
     [
         (lambda t: t, (), "does not state the coordinate system of its points"),
-        (lambda t: t, (), "they would fit"),
         (lambda t: t.rename(columns={"X_m": "Y_m", "Y_m": "X_m"}), ("--control-epsg", CODE), "coordinates exchanged"),
-        (lambda t: t, ("--control-epsg", CODE + 1), "would fit EPSG:32633"),
+        (lambda t: t, ("--control-epsg", CODE + 1), "if their system is EPSG:32634"),
         (lambda t: t.drop(columns="X_m"), ("--control-epsg", CODE), "not a control file"),
-        (lambda t: t, ("--control-epsg", CODE, "--targets", "disc"), "write one of circle"),
     ],
 )
 def test_control_that_cannot_be_ends_before_anything_is_matched(
     flown, tmp_path, monkeypatch, capsys, change, options, message
 ):
     change(pd.read_csv(flown / "survey.csv")).to_csv(tmp_path / "survey.csv", index=False)
-    given = ("fly", flown / "photographs", "--out", tmp_path / "o", "--control", tmp_path / "survey.csv", *options)
+    given = ("fly", flown / "photographs", "--out", tmp_path / "o", "--control", tmp_path / "survey.csv")
+    given += ("--marks", flown / "marks.csv", *options)
     code, _, wrong = run(monkeypatch, capsys, *given)
     assert code == 2 and message in wrong and not (tmp_path / "o").exists(), wrong

@@ -5,11 +5,10 @@ import pytest
 from scipy.spatial.transform import Rotation
 
 from jaxphoto.extras.photos.features import FEATURES
-from jaxphoto.extras.photos.matching import match_photographs
-from jaxphoto.extras.photos.photograph_pairs import photograph_pairs
+from jaxphoto.extras.photos.matching import match_photographs, photograph_pairs
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from jaxphoto.procedures.orientation import orient
-from jaxphoto.procedures.orientation.known_frame import similarity_between
+from jaxphoto.procedures.orientation.blocks import similarity_between
 
 pytestmark = pytest.mark.slow
 

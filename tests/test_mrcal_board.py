@@ -12,7 +12,7 @@ from jaxphoto.adjustment import NormalEquations
 from jaxphoto.adjustment.normal_equations import factor_normal
 from jaxphoto.camera import Brown, InteriorOrientation, OpenCv, Sensor, get_parameter, set_parameter
 from jaxphoto.procedures.calibration import CAMERA, Board, Detection, TargetRows, calibration_block
-from jaxphoto.procedures.calibration.target_block import resected
+from jaxphoto.procedures.calibration.start import resected
 from jaxphoto.statistics.sigma_map import sigma_map
 from tests.adjustment.dense import prepared
 

@@ -79,20 +79,6 @@ def test_a_folder_with_something_else_is_left_alone(taken, tmp_path, monkeypatch
     assert "full is not empty" in wrong
 
 
-@pytest.mark.parametrize(
-    ("options", "named"),
-    [
-        (["--c-mm", "8"], "--c-mm"),
-        (["--pixel-mm", "0.005", "--pairs", "exhaustive"], "--pairs, --pixel-mm"),
-        (["--model", "brown", "--r0-mm", "0"], "--model, --r0-mm"),
-    ],
-)
-def test_options_for_photographs_mean_nothing_for_a_block(options, named, tmp_path, monkeypatch, capsys):
-    code, _, wrong = run(monkeypatch, capsys, "orient", "examples/cross_block", "--out", tmp_path / "block", *options)
-    assert code == 2
-    assert f"omit {named}, or change block.toml" in wrong
-
-
 def test_rounds_that_do_not_settle_are_said(taken, tmp_path, monkeypatch, capsys):
     # Not even an iteration that rejects nothing ends them.
     monkeypatch.setattr(orient_photographs, "_CONVERGED", -1.0)
@@ -126,9 +112,3 @@ def test_photographs_that_show_nothing_are_named(taken, tmp_path, monkeypatch, c
     assert f"wrote {out}" in said
     summary = json.loads((out / "orientation.json").read_text())
     assert list(summary["unoriented"]) == ["wall[red]"]
-
-
-def test_a_block_that_has_a_beginning_is_handed_back(tmp_path, monkeypatch, capsys):
-    code, _, wrong = run(monkeypatch, capsys, "orient", "examples/cross_block", "--out", tmp_path / "block")
-    assert code == 2
-    assert "needs no orientation" in wrong

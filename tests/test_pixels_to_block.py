@@ -11,7 +11,7 @@ from scipy.stats import chi2
 
 from jaxphoto import adjust, covariance
 from jaxphoto.io import read_block
-from jaxphoto.procedures.orientation.known_frame import similarity_between
+from jaxphoto.procedures.orientation.blocks import similarity_between
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from tests.commands import run
 from tests.formulas import camera_from_object

@@ -12,7 +12,7 @@ from jaxphoto.adjustment import Outcome
 from jaxphoto.block import Frame
 from jaxphoto.camera import get_parameter
 from jaxphoto.procedures.control import at_optimum, control_block
-from jaxphoto.procedures.orientation.known_frame import Similarity
+from jaxphoto.procedures.orientation.blocks import Similarity
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from jaxphoto.statistics import (
     check_discrepancies,

@@ -11,7 +11,6 @@ from typing import get_args
 import pytest
 from typer.main import get_command
 
-from jaxphoto.camera.undistortion import Keep
 from jaxphoto.extras.formats import CAMERAS_WRITTEN, LOSS_PX
 from jaxphoto.extras.photos.features import LONGEST_PX
 from jaxphoto.georeferencing import PATTERNS, ScannerCalibration
@@ -31,7 +30,7 @@ from jaxphoto.sensitivity import PER
 from jaxphoto.sensitivity.influence import DELTA0, Per
 from jaxphoto.stability import METHODS as ALIGNMENTS
 from jaxphoto.statistics import EOP_NAMES
-from jaxphoto_command import app, blocks, examples, files, lidar, photographs
+from jaxphoto_command import app, blocks, examples, files, lidar
 from tests.commands import run
 
 COMMANDS = get_command(app).commands
@@ -44,7 +43,6 @@ CHOICES = [
     (blocks.sensitivity, "per", get_args(Per)),
     (blocks.halves, "method", ALIGNMENTS),
     (files.camera, "out_format", CAMERAS_WRITTEN),
-    (photographs.undistort, "keep", get_args(Keep)),
     (lidar.lidar_control, "method", METHODS),
     (lidar.lidar_control, "returns", get_args(Returns)),
     (lidar.simultaneous, "method", get_args(Method)),

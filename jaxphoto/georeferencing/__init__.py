@@ -9,7 +9,7 @@ from jaxphoto.georeferencing.direct import (
     direct_partials,
 )
 from jaxphoto.georeferencing.gnss_bias import FlightBias
-from jaxphoto.georeferencing.ground import RayCovariance, Surface, ground_covariance, ground_point
+from jaxphoto.georeferencing.ground import Surface, ground_point
 from jaxphoto.georeferencing.lever_arm import (
     arm_to_camera,
     exact_offset,
@@ -50,10 +50,10 @@ from jaxphoto.georeferencing.trajectory_knots import (
 
 __all__ = [
     "IMAGE_X", "NOMINAL", "PATTERNS", "Corrections", "DirectPartials", "Exposure", "FlightBias", "Mount",
-    "Pattern", "Poses", "RayCovariance", "RigCamera", "Scanner", "ScannerCalibration", "SensorCovariance", "StripBias",
+    "Pattern", "Poses", "RigCamera", "Scanner", "ScannerCalibration", "SensorCovariance", "StripBias",
     "StripErrors", "StripSpline", "Surface", "Trajectory", "TrajectoryKnot", "TrajectorySpline", "apparent_point",
     "arm_to_camera", "attitude_residual", "body_from_camera", "corrected_point", "corrected_return", "corrected_shot",
-    "covered", "direct_covariance", "direct_orientation", "direct_partials", "exact_offset", "ground_covariance",
+    "covered", "direct_covariance", "direct_orientation", "direct_partials", "exact_offset",
     "ground_point", "in_rig", "interpolate", "knot_name", "level_error", "level_offset", "object_from_body",
     "raised_by_boresight", "recorded_attitude", "reference_later", "refraction_constant", "rig_place", "rig_turn",
     "sensor_position", "spline_through", "strip_of_knot", "turn_off", "weighted_knot", "worst_level_error",

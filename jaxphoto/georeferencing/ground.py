@@ -1,4 +1,4 @@
-"""Projection of image coordinates to the ground (horizontal plane or surface), with covariance.
+"""Projection of image coordinates to the ground (horizontal plane or surface).
 
 Functions take one image and one point (monoplotting). Frames and units: docs/conventions.md, equations: docs/models.md.
 """
@@ -32,19 +32,6 @@ class Surface(eqx.Module):
 
 Ground = Surface | Float[Array, ""] | float
 """Surface, or Z (m) of a horizontal plane."""
-
-
-class RayCovariance(eqx.Module):
-    """Covariances of the inputs of a ground point, mutually independent."""
-
-    exterior: Float[Array, "6 6"]
-    """Covariance of X, Y, Z (m) and a small rotation in the camera frame (rad), as from `direct_covariance`."""
-    interior: Float[Array, "k k"]
-    """Covariance of the interior orientation, in the order of `camera.parameter_names`; zeros if error-free."""
-    image: Float[Array, "2 2"]
-    """Covariance of the measured image coordinate (mm^2)."""
-    height: Float[Array, ""] | float
-    """Variance of the height of the plane or surface (m^2)."""
 
 
 def ground_point(
@@ -85,35 +72,6 @@ def ground_point(
     else:
         height, met = jnp.asarray(ground, float), jnp.array(True)
     return at_height(height), ~upright & ((height - origin[2]) / fall > 0) & met
-
-
-def ground_covariance(
-    interior: InteriorOrientation,
-    exterior: ExteriorOrientation,
-    xy: Float[Array, "2"],
-    ground: Ground,
-    covariance: RayCovariance,
-    corrections: Corrections = NO_CORRECTIONS,
-) -> Float[Array, "3 3"]:
-    """Return the covariance (m^2) of `ground_point`, by first-order propagation.
-
-    The height error shifts the whole surface: the point moves along the ray.
-    """
-
-    def moved(d_exterior, d_interior, d_xy, d_height):
-        new = moved_exterior(exterior, d_exterior)
-        raised = (
-            Surface(lambda x, y: ground.height(x, y) + d_height, ground.low, ground.high)
-            if isinstance(ground, Surface)
-            else ground + d_height
-        )
-        return ground_point(moved_interior(interior, d_interior), new, xy + d_xy, raised, corrections)[0]
-
-    zeros = (jnp.zeros(6), jnp.zeros(len(parameter_names(interior))), jnp.zeros(2), jnp.zeros(()))
-    by_exterior, by_interior, by_xy, by_height = jax.jacfwd(moved, argnums=(0, 1, 2, 3))(*zeros)
-    from_images = by_exterior @ covariance.exterior @ by_exterior.T + by_xy @ covariance.image @ by_xy.T
-    from_camera = by_interior @ covariance.interior @ by_interior.T
-    return from_images + from_camera + covariance.height * jnp.outer(by_height, by_height)
 
 
 def moved_exterior(exterior: ExteriorOrientation, step: Float[Array, "6"]) -> ExteriorOrientation:

@@ -21,7 +21,6 @@ from jaxtyping import Float
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.initial.nonlinearity import is_nonlinear, typical_errors
 from jaxphoto.initial.quaternions import best_rotations, rotated
 from jaxphoto.initial.rays import ideal_coordinates, unit_rays
 from jaxphoto.initial.resection import (
@@ -45,6 +44,10 @@ _ASIDE = np.array([-0.3, -0.03, 0.03, 0.3])  # fractions of the distance, and ra
 # Maximum standard deviation, as a fraction of the distance or in rad, of a usable orientation.
 _OPEN = 0.1
 _HOPELESS = 0.05  # maximum root mean square residual as a fraction of c
+# Errors x of u unknowns with the normal matrix N increase the squared residuals by x' N x = u sigma^2 on average. If
+# they increase far more or hardly at all, no covariance describes the errors: near a dangerous surface.
+_SAMPLES, _QUANTILES = 16, (0.1, 0.9)
+_FACTOR = 3.0  # maximum ratio of the increase to the expected one, and of its inverse
 _AS_GOOD = 9.0  # maximum difference of squared residuals (sigma^2) of equally good solutions: three sigmas
 
 
@@ -222,3 +225,19 @@ def _alternatives(c, ideal, points, refined: RefinedResections):
     if np.sqrt(np.mean(error**2)) < _HOPELESS * c:
         positions, matrices = np.concatenate([positions, beyond[None]]), np.concatenate([matrices, mirrored[None]])
     return positions, matrices
+
+
+def typical_errors(normal: Float[np.ndarray, "u u"], sigma: float) -> Float[np.ndarray, "steps u"]:
+    """Draw errors of one-sigma size in random directions and their opposites, for a normal matrix and observation
+    sigma.
+    """
+    values, vectors = np.linalg.eigh(normal)
+    drawn = np.random.default_rng(0).normal(size=(_SAMPLES, len(normal)))
+    drawn *= np.sqrt(len(normal)) / np.linalg.norm(drawn, axis=1, keepdims=True)
+    return np.concatenate([drawn, -drawn]) * sigma / np.sqrt(np.maximum(values, 1e-300)) @ vectors.T
+
+
+def is_nonlinear(growth: Float[np.ndarray, " steps"], unknowns: int, sigma: float) -> bool:
+    """Return True if the increase of the squared residuals at `typical_errors` deviates from a linear adjustment."""
+    least, most = np.quantile(growth / (unknowns * sigma**2), _QUANTILES)
+    return not (least > 1 / _FACTOR and most < _FACTOR)

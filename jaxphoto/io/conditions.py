@@ -13,7 +13,7 @@ import pandas as pd
 
 from jaxphoto.camera.conditions import NUMBERS, TEXTS, Conditions
 from jaxphoto.errors import InputError
-from jaxphoto.io.photograph_metadata import TAG, Exif, number, open_picture, read_exif, text
+from jaxphoto.io.photographs import TAG, Exif, number, open_picture, read_exif, text
 from jaxphoto.writing import input_file
 
 CONDITIONS = "conditions.csv"

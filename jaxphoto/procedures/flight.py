@@ -1,36 +1,83 @@
 """Calibrate a flight from matched photographs: each connected part, the largest first."""
 
 from collections import deque
-from collections.abc import Mapping, Sequence
-from typing import NamedTuple
+from collections.abc import Collection, Iterable, Mapping
+from typing import Any, NamedTuple
+
+import numpy as np
 
 from jaxphoto.adjustment import MINIMAL_SIZES, Adjustment
-from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, Sensor
-from jaxphoto.errors import BlockError, DatumError, GroupsError, InputError, RankError
+from jaxphoto.errors import BlockError, DatumError, GroupsError, InputError, JaxphotoError, RankError, few
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
-from jaxphoto.georeferencing.gps import Gps
+from jaxphoto.georeferencing.recorded_positions import Gps
+from jaxphoto.initial.matches import MatchedPart
 from jaxphoto.procedures.adjust import adjust_for_tables
-from jaxphoto.procedures.control import ControlledBlock, retest
-from jaxphoto.procedures.control.of_flight import FlightControl, adjust_with_control, parts_with_marks
+from jaxphoto.procedures.control import ControlledBlock, control_block, retest
+from jaxphoto.procedures.control.control_block import new_code, stated_system
+from jaxphoto.procedures.control.marks import images_of
+from jaxphoto.procedures.control.surveyed import GivenControl, check_near
 from jaxphoto.procedures.georeference_photographs import (
     GeoreferencedPhotographs,
     georeference_photographs,
     with_fixed_datum,
-    with_observed_scatter,
 )
 from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
-from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation import Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA, Report
 from jaxphoto.procedures.rolling_shutter import NEIGHBOUR_M, Moment, with_rolling_shutter
-from jaxphoto.statistics import VarianceComponents, variance_components
+from jaxphoto.statistics import Selection, VarianceComponents, variance_components
 
 # Number of random vectors of the trace estimate. Each is expensive with 1e5 image points; variance components are few.
 _PROBES = 16
 # Minimum number of unoriented photographs that form a separate part; two would have no redundancy.
 _PART_OF_ITS_OWN = 3
 _NO_PAIR = "no relative orientation to any other photograph"
+
+
+class FlightControl(NamedTuple):
+    """Control, and the coordinate system of its points if the file does not specify one."""
+
+    control: GivenControl
+    system: str | None
+    images: tuple[str, ...]
+    """All valid photographs of the flight."""
+    local: bool
+    """True for points in local Cartesian metres, which are unrelated to the positions of photographs."""
+
+
+def flight_control(
+    control: GivenControl,
+    system: str | None,
+    images: Iterable[str],
+    positions: Iterable[Gps | None],
+    code: int | None = None,
+) -> tuple[FlightControl, int | None]:
+    """Check control against photographs, and return the EPSG code of the flight: `code`, or the code of the points.
+
+    Raises InputError if no mark is in one of the `images`, for a missing or invalid system, for a local one together
+    with `code`, and for points far from the `positions`.
+    """
+    recorded = [gps for gps in positions if gps is not None]
+    place = np.median([(g.longitude_deg, g.latitude_deg) for g in recorded], axis=0) if recorded else None
+    stated = stated_system(control.points, system)
+    if place is not None and stated.crs is not None:
+        check_near(control.points, stated, *place)
+    names = tuple(images)
+    if len(control.marks.image) and (images_of(control.marks.image, names) < 0).all():
+        raise InputError(
+            f"{control.marks.places[0]}: no mark is in one of the {len(names)} photographs ({few(names)}), but in "
+            f"{few(list(dict.fromkeys(control.marks.image)))}; use the names of their files"
+        )
+    if stated.crs is None:
+        if code is not None:
+            raise InputError(
+                f"{control.points.file} is in a local system, and EPSG:{code} is given for the block; omit the code, "
+                "or give the control in a map system"
+            )
+        return FlightControl(control, system, names, local=True), None
+    flight_code = new_code(control.points, stated) if code is None else code
+    return FlightControl(control, system, names, local=False), flight_code
 
 
 class KnownOfFlight(NamedTuple):
@@ -46,8 +93,6 @@ class KnownOfFlight(NamedTuple):
     """Exposure times, if a rolling shutter is to be estimated."""
     vertical: int | None = None
     """EPSG code of the heights; None for ellipsoidal heights."""
-    order: Sequence[str] = ()
-    """Photographs in exposure order; by default sorted by name."""
 
 
 class FlightPart(NamedTuple):
@@ -133,13 +178,18 @@ def _calibrated(
     else:
         try:
             placed = georeference_photographs(
-                oriented.block, prior.positions, prior.code, prior.attitudes, prior.vertical, prior.order
+                oriented.block, prior.positions, prior.code, prior.attitudes, prior.vertical
             )
         except (InputError, BlockError) as error:
             why_not = str(error)
     block = placed.block if placed else oriented.block
     if prior.control is not None:
-        controlled, no_control = adjust_with_control(block, prior.control, prior.code, prior.vertical, report)
+        how: dict[str, Any] = {"system": prior.control.system, "code": prior.code, "vertical": prior.vertical}
+        try:
+            elsewhere = prior.control.images
+            controlled = control_block(block, prior.control.control, elsewhere=elsewhere, report=report, **how)
+        except JaxphotoError as error:
+            no_control = str(error)
     try:
         # Without positions, adjust the network of the orientation, to reuse its compiled code.
         sizes = MINIMAL_SIZES if placed else oriented.sizes
@@ -147,7 +197,9 @@ def _calibrated(
     except (InputError, BlockError, DatumError, RankError) as error:
         if placed is None:
             raise
-        placed, why_not, adjusted = _placed_otherwise(placed, prior.positions, oriented.block, error)
+        # The stations determine the datum too weakly: use them for georeferencing only.
+        placed, why_not = with_fixed_datum(placed, oriented.block.datum), str(error)
+        adjusted = adjust_for_tables(placed.block)
     metric = bool(controlled or (placed and not why_not))
     adjusted, why_no_shutter = _rolling(adjusted, prior.taken, metric)
     components = None
@@ -155,7 +207,7 @@ def _calibrated(
     if (placed or controlled or lens) and bool(adjusted.converged):
         report("estimating variance components")
         marked = {controlled.ids[p] for p in controlled.marks.point} if controlled else ()
-        components = variance_components(adjusted, parts_with_marks(adjusted, marked), probes=_PROBES)
+        components = variance_components(adjusted, _component_parts(adjusted, marked), probes=_PROBES)
         # Variance components are not used unless their estimation converged; the report states this.
         adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
     return FlightPart(
@@ -163,19 +215,6 @@ def _calibrated(
         retest(controlled, adjusted) if controlled else None, no_control,
         lens.sentences(oriented.block, CAMERA) if lens else (), why_no_shutter,
     )  # fmt: skip
-
-
-def _placed_otherwise(
-    placed: GeoreferencedPhotographs, positions: Mapping[str, Gps | None], block: Block, error: Exception
-) -> tuple[GeoreferencedPhotographs | None, str, Adjustment]:
-    """Adjust a part whose stations determine the datum too weakly: with their scatter as sigma, or without them."""
-    if isinstance(error, DatumError) and (better := with_observed_scatter(placed, positions)):
-        try:
-            return better, "", adjust_for_tables(better.block)
-        except (InputError, BlockError, DatumError, RankError) as again:
-            error = again
-    held = with_fixed_datum(placed, block.datum)
-    return held, str(error), adjust_for_tables(held.block if held else block)
 
 
 def _rolling(adjusted: Adjustment, taken: Mapping[str, Moment] | None, metric: bool) -> tuple[Adjustment, str]:
@@ -191,3 +230,15 @@ def _rolling(adjusted: Adjustment, taken: Mapping[str, Moment] | None, metric: b
     if not bool(rolling.converged):
         return adjusted, f"no rolling shutter is estimated: {rolling.outcome.value}"
     return rolling, ""
+
+
+def _component_parts(adjusted: Adjustment, marked: Collection[str]) -> dict[str, Selection]:
+    """Return observation groups with a variance component each: features, marks, stations in plan and height."""
+    parts = {"image points": Selection("image_points")}
+    if marked:
+        ties = [name for name in adjusted.block.points if name not in marked]
+        parts["image points"] = Selection("image_points", points=ties)
+        parts["marks"] = Selection("image_points", points=set(marked))
+    if len(adjusted.block.stations):
+        parts |= {"stations X-Y": Selection("stations", axes=("X", "Y")), "stations Z": Selection("stations", axes="Z")}
+    return parts

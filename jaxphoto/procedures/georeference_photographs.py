@@ -2,6 +2,11 @@
 
 A free network has an arbitrary frame and scale. The similarity from its projection centres to the recorded positions is
 estimated robustly from consistent positions. Contradicting positions are rejected and reported.
+
+Each photograph gives the rotation from network to map: the product of its recorded and its oriented attitude. The
+average determines the rotation about the line of a single strip, which positions do not determine. It contains the
+common error of all attitudes (zero of a gimbal, mounting). As observations, attitudes therefore have a boresight with a
+prior of that size.
 """
 
 import dataclasses
@@ -9,28 +14,180 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import NamedTuple
 
 import equinox as eqx
+import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 from pyproj.aoi import AreaOfInterest
 from pyproj.database import query_utm_crs_info
 
+from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block, Datum, Frame
-from jaxphoto.compiling import call_compiled
+from jaxphoto.compiling import call_compiled, jit_quickly
 from jaxphoto.errors import InputError, counted, few
+from jaxphoto.georeferencing import Mount
 from jaxphoto.georeferencing.camera_attitude import CameraAttitude
 from jaxphoto.georeferencing.datum_change import datum_change
-from jaxphoto.georeferencing.gps import Gps
 from jaxphoto.georeferencing.map_frame import MapFrame, map_name
+from jaxphoto.georeferencing.recorded_positions import Gps
+from jaxphoto.initial.quaternions import average_rotation
 from jaxphoto.initial.rays import padded, padded_length
 from jaxphoto.least_squares import least_squares
-from jaxphoto.observations import CameraPositions
-from jaxphoto.procedures.orientation.known_frame import Similarity, similarity_between
-from jaxphoto.procedures.position_steps import position_parts, with_part_shifts
-from jaxphoto.procedures.recorded_attitudes import RecordedRotation, recorded_rotation, with_attitudes
-from jaxphoto.rotation import small_angles, small_rotation
+from jaxphoto.observations import Attitudes, CameraPositions
+from jaxphoto.procedures.orientation.blocks import Similarity, similarity_between
+from jaxphoto.rotation import roll_pitch_yaw_from_matrix, small_angles, small_rotation
+from jaxphoto.unknowns import FIXED, Weighted
 from jaxphoto.variants import without_stations
+
+BORESIGHT_DEG = (2.0, 2.0, 2.0)
+"""Standard deviations (degrees) of the common error of the attitudes of a flight, about the camera's axes: gimbal or
+mounting, and declination of a compass.
+"""
+# Maximum ratio of a deviation to the median deviation; minimum of this limit (degrees).
+_BEYOND, _LEAST_DEG = 4.0, 5.0
+# Median deviation (degrees) above which attitudes are contradictory.
+_CONTRADICT_DEG = 15.0
+# Minimum cosine between directions in the rotated network and of positions; pictures that software rotated by 90
+# degrees contradict the attitudes of the sensor.
+_OTHER_LINE = 0.5
+# Maximum median relative error of distances for positions to determine directions; number of positions below which only
+# distant pairs are used; minimum distance of these in standard deviations.
+_TELLING, _FEW, _APART = 0.1, 6, 3.0
+# Maximum number of photographs compared pairwise, as memory increases with its square.
+_MOST = 500
+# Name of the mount that a block folder applies to all cameras.
+_MOUNT = "default"
+
+
+class RecordedRotation(NamedTuple):
+    """Rotation of a network by recorded attitudes."""
+
+    image: np.ndarray
+    """Images of the block whose attitudes agree."""
+    local_from_camera: Float[np.ndarray, "n 3 3"]
+    sigma_rad: Float[np.ndarray, "n 3"]
+    """Standard deviations of roll, pitch, yaw."""
+    turn: Float[np.ndarray, "3 3"]
+    """Rotation from the network frame to the local frame."""
+    turn_sigma_rad: float
+    """Standard deviation of the rotation about a horizontal axis, including the boresight."""
+    scatter_rad: float
+    """RMS deviation of single attitudes from `turn`."""
+    left_out: tuple[str, ...]
+
+
+def recorded_rotation(
+    block: Block,
+    attitudes: Mapping[str, CameraAttitude | None],
+    places: Mapping[str, Float[np.ndarray, "3"]],
+    sigma_m: Mapping[str, Float[np.ndarray, "3"]],
+    frame: MapFrame,
+) -> RecordedRotation | str | None:
+    """Estimate the rotation from the `attitudes` of images that also have `places` (longitude, latitude, height, +-
+    `sigma_m`).
+
+    Return None without attitudes, and a message if they contradict each other or the positions.
+    """
+    usable = [(k, name, a) for k, name in enumerate(block.images) if name in places and (a := attitudes.get(name))]
+    if not usable:
+        return None
+    local = frame.local_from_place(np.array([places[name] for _, name, _ in usable], float))
+    attitude = frame.local_from_level(local) @ np.array([a.level_from_camera for _, _, a in usable])
+    network = np.asarray(block.start.unknowns.exterior.position, float)[[k for k, _, _ in usable]]
+    sigma = np.linalg.norm([sigma_m[name] for _, name, _ in usable], axis=1)
+    first = _rotation_of(block, usable, attitude)
+    along = _cosine(network, local, sigma, first)
+    if isinstance(first, RecordedRotation) and (along is None or along > _OTHER_LINE):
+        return first
+    if along is None:
+        return first
+    apart_deg = np.rad2deg(np.arccos(np.clip(along, -1, 1)))
+    return (
+        f"the attitudes of the files contradict the positions by {apart_deg:.0f} degrees (pictures rotated by a "
+        "program?): not used"
+    )
+
+
+def _rotation_of(
+    block: Block, usable: list[tuple[int, str, CameraAttitude]], attitude: Float[np.ndarray, "n 3 3"]
+) -> RecordedRotation | str:
+    """Return the rotation by attitudes (local from camera) of the `usable` images; a message if they contradict."""
+    image = np.array([k for k, _, _ in usable])
+    rotations = attitude @ np.asarray(block.start.unknowns.exterior.camera_from_object, float)[image]
+    sigma = np.deg2rad([a.sigma_deg for _, _, a in usable])
+    inlier, deviation = np.ones(len(rotations), bool), np.zeros(len(rotations))
+    # Start at the rotation with the smallest median distance to all others, then average the rotations near it.
+    some = rotations[_subset(len(rotations))]
+    apart = _angles(np.einsum("nji,mjk->nmik", some, some))
+    turn = some[np.argmin(np.median(apart, axis=1))]
+    for _ in range(5):
+        deviation = _angles(rotations @ turn.T)
+        inlier = deviation <= max(_BEYOND * float(np.median(deviation)), np.deg2rad(_LEAST_DEG))
+        turn, _ = average_rotation(rotations[inlier])
+    apart_deg = np.rad2deg(np.median(deviation))
+    if apart_deg > _CONTRADICT_DEG:
+        return f"the attitudes of the files contradict the photographs by {apart_deg:.0f} degrees: not used"
+    scatter = float(np.sqrt(np.mean(_angles(rotations[inlier] @ turn.T) ** 2)))
+    level = np.sqrt(np.mean(sigma[inlier, :2] ** 2) / inlier.sum() + np.deg2rad(max(BORESIGHT_DEG[:2])) ** 2)
+    lost = tuple(name for (_, name, _), good in zip(usable, inlier, strict=True) if not good)
+    return RecordedRotation(image[inlier], attitude[inlier], sigma[inlier], turn, float(level), scatter, lost)
+
+
+def _subset(n: int) -> Int[np.ndarray, "m"]:
+    """Return evenly spaced indices of at most `_MOST` photographs."""
+    return np.linspace(0, n - 1, min(n, _MOST)).astype(int)
+
+
+def _cosine(
+    network: Float[np.ndarray, "n 3"],
+    local: Float[np.ndarray, "n 3"],
+    sigma: Float[np.ndarray, "n"],
+    recorded: RecordedRotation | str,
+) -> float | None:
+    """Return the median cosine between directions in the rotated network and on the ground; None if undetermined."""
+    some = _subset(len(local))
+    one, other = (some[k] for k in np.triu_indices(len(some), 1))
+    if isinstance(recorded, str) or not len(one):
+        return None
+    a, b = ((v[one] - v[other]) for v in (network @ recorded.turn.T, local))
+    there, here = np.linalg.norm(a, axis=1), np.linalg.norm(b, axis=1)
+    far = (here >= np.median(here)) & (there > 0) & (here > 0)
+    if len(local) < _FEW:
+        far &= here > _APART * np.hypot(sigma[one], sigma[other])
+    if not far.any():
+        return None
+    ratio = here[far] / there[far]
+    if np.median(np.abs(ratio / np.median(ratio) - 1)) > _TELLING:
+        return None
+    return float(np.median(np.sum(a[far] * b[far], axis=1) / (there[far] * here[far])))
+
+
+def with_attitudes(block: Block, recorded: RecordedRotation) -> Block:
+    """Observe the attitudes, of a nadir camera with the top of its pictures forward."""
+    angles = _roll_pitch_yaw(recorded.local_from_camera)
+    zero = np.zeros(3)
+    mount = Mount(as_jax_array(zero), as_jax_array(zero), as_jax_array(0.0), "right")  # type: ignore[arg-type]
+    boresight = Weighted(zero, np.deg2rad(BORESIGHT_DEG))
+    prior = Mount(FIXED, boresight, FIXED, "right")  # type: ignore[arg-type]
+    unknowns = dataclasses.replace(block.start.unknowns, mounts={_MOUNT: mount})
+    return dataclasses.replace(
+        block,
+        attitudes=Attitudes(recorded.image, as_jax_array(np.asarray(angles)), as_jax_array(recorded.sigma_rad)),
+        image_mount=(_MOUNT,) * len(block.images),
+        start=dataclasses.replace(block.start, unknowns=unknowns),
+        priors=dataclasses.replace(block.priors, mounts={_MOUNT: prior}),
+    )
+
+
+def _angles(matrices: Float[np.ndarray, "*n 3 3"]) -> Float[np.ndarray, "*n"]:
+    """Return rotation angles (rad), from the chord, which is accurate for small angles."""
+    chord = np.linalg.norm(matrices - np.eye(3), axis=(-2, -1))
+    return 2 * np.arcsin(np.clip(chord / np.sqrt(8), 0, 1))
+
+
+_roll_pitch_yaw = jit_quickly(jax.vmap(roll_pitch_yaw_from_matrix))
+
 
 SIGMA_M = (2.0, 2.0, 4.0)
 """Default standard deviations (m) of single-point GNSS positions (east, north, up), if the file has none. Larger
@@ -39,17 +196,15 @@ within 8 m in plan and 13 m in height). Variance components refine them.
 """
 # Number of samples of three positions: with 40 % outliers, one sample in five is valid.
 _SAMPLES = 200
-# Maximum ratio of a distance to the median distance: six standard deviations of a 3-D normal error.
-_BEYOND = 4.0
 # Maximum distance in standard deviations: exceeded by one position in a thousand.
 _BEYOND_OWN = 4.0
 _LEAST = 3
 # Minimum number of positions with attitudes, which determine the rotation.
 _LEAST_TURNED = 2
-# Maximum standard deviation (rad) of the rotation from positions; above it a local frame is better.
+# Maximum number of rejected positions with a message each.
+_LISTED = 10
+# Maximum standard deviation (rad) of the rotation from positions.
 _FIXED_RAD = 0.3
-# Minimum number of positions for an estimate of their scatter; minimum of the estimate (m).
-_SCATTER, _FINEST_M = 6, 0.05
 # Minimum upward component of the mean viewing direction of an inverted block.
 _LOOK_UP = 0.5
 
@@ -61,15 +216,9 @@ class GeoreferencedPhotographs(NamedTuple):
     images: tuple[str, ...]
     """Images with a position, in the order of the rows of the following arrays."""
     offsets_m: Float[np.ndarray, "images 3"]
-    """Recorded minus network position after the similarity: east, north, up; shifts of parts removed."""
+    """Recorded minus network position after the similarity: east, north, up."""
     used: Bool[np.ndarray, "images"]
     sentences: tuple[str, ...]
-    steps: tuple[str, ...] = ()
-    """One message per position step."""
-    level: bool = False
-    """True if the rotation about the line of a strip is undetermined, and assumed such that the photographs look down
-    on average.
-    """
 
 
 def georeference_photographs(
@@ -78,18 +227,16 @@ def georeference_photographs(
     code: int | None = None,
     attitudes: Mapping[str, CameraAttitude | None] | None = None,
     vertical: int | None = None,
-    order: Sequence[str] = (),
 ) -> GeoreferencedPhotographs:
     """Transform `block`, a free network, to the EPSG system `code` (default UTM) by the `positions` of its images.
 
     `vertical` is the EPSG code of the block's heights in files; None: ellipsoidal. Positions and ellipsoidal heights
     are transformed from WGS 84 to the datum of the system; other heights are used as recorded. Standard deviations come
     from the file, otherwise from `SIGMA_M`. If `attitudes` determine the rotation better than the positions (a single
-    strip), they are also observed. Positions with jumps in the `order` of exposures (default: order of the block) get
-    one shift per part (`position_steps`).
+    strip), they are also observed.
 
-    Raises InputError if fewer than three positions agree or all lie on a line without attitudes, and for unknown codes
-    and unavailable geoids.
+    Raises InputError if fewer than three positions agree, if they do not determine the rotation and there are no
+    attitudes, and for unknown codes and unavailable geoids.
     """
     usable = {name: gps for name in block.images if (gps := positions.get(name)) and gps.altitude_m is not None}
     turned = {name for name in usable if attitudes and attitudes.get(name) is not None}
@@ -116,22 +263,27 @@ def georeference_photographs(
     rotation = recorded_rotation(block, attitudes or {}, at, sigma_of, frame)
     # Without stated standard deviations, test positions only by their median distance.
     own_sigmas = sigmas if any(gps.stated_sigma_m for gps in usable.values()) else np.zeros_like(sigmas)
-    fitted = _fit(block, image, here, sigmas, own_sigmas, rotation)
-    # Drift of single-point GNSS within minutes is smaller than its standard deviation, and not a jump.
-    parts = position_parts(list(usable), order, here - fitted.similarity.of(there), here, np.median(sigmas, axis=0))
-    raw, here = here, here - parts.off_m
-    if parts.sentences:
-        fitted = _fit(block, image, here, sigmas, own_sigmas, rotation)
-    similarity, used, helping, level = fitted
+    similarity, used = None, np.ones(len(here), bool)
+    helping = rotation if isinstance(rotation, RecordedRotation) else None
+    if helping is not None:
+        similarity, used = _fit_with_rotation(there, here, helping.turn, own_sigmas)
+        if not helping.turn_sigma_rad < _rotation_sigma(similarity.of(there)[used], sigmas[used]):
+            similarity, helping = None, None
+    if similarity is None:
+        similarity, used = _fit_by_positions(there, here, own_sigmas)
+        if not (uncertainty := _rotation_sigma(similarity.of(there)[used], sigmas[used])) <= _FIXED_RAD:
+            raise InputError(
+                f"the {len(usable)} positions of the photographs lie on a line or determine the rotation of the block "
+                f"only to {np.rad2deg(uncertainty):.0f} degrees. Fly a cross strip, measure control points, or give "
+                "attitudes or standard deviations of the positions"
+            )
     sigma = _sigmas(list(usable.values()), (here - similarity.of(there))[used])
-    if not level:
-        similarity = _least_squares_similarity(similarity, there[used], here[used], sigma[used], helping)
+    similarity = _least_squares_similarity(similarity, there[used], here[used], sigma[used], helping)
     _check_upright(block, similarity)
     rows, axis = np.flatnonzero(used).repeat(3), np.tile(np.arange(3), used.sum())
-    stations = CameraPositions(image[rows], axis, raw[rows, axis], sigma[rows, axis])
     placed = dataclasses.replace(
-        with_part_shifts(similarity.of_block(block), parts, image),
-        stations=stations,
+        similarity.of_block(block),
+        stations=CameraPositions(image[rows], axis, here[rows, axis], sigma[rows, axis]),
         datum=Datum(),
         frame=Frame("epsg", code, vertical, origin=origin),
     )
@@ -142,80 +294,13 @@ def georeference_photographs(
         *change.sentences(received, ellipsoidal),
         *position_messages(map_name(code, vertical), block.images, usable, offsets, used, sigma),
         *attitude_messages(rotation, helping is not None, similarity.turn),
-        *([LEVEL_MESSAGE] if level else ()),
     )
-    return GeoreferencedPhotographs(placed, tuple(usable), offsets, used, messages, parts.sentences, level)
+    return GeoreferencedPhotographs(placed, tuple(usable), offsets, used, messages)
 
 
-def with_observed_scatter(
-    placed: GeoreferencedPhotographs, positions: Mapping[str, Gps | None]
-) -> GeoreferencedPhotographs | None:
-    """Replace assumed standard deviations of positions by their scatter, if that is smaller.
-
-    Four of the similarity's seven parameters concern plan, three height. Return None if a file states standard
-    deviations, positions are too few, or their scatter is not smaller.
-    """
-    names = [name for name, used in zip(placed.images, placed.used, strict=True) if used]
-    offset, n = placed.offsets_m[placed.used], len(names)
-    if n < _SCATTER or any((gps := positions[name]) and gps.stated_sigma_m for name in names):
-        return None
-    plan = max(float(np.sqrt(np.sum(offset[:, :2] ** 2) / (2 * n - 4))), _FINEST_M)
-    height = max(float(np.sqrt(np.sum(offset[:, 2] ** 2) / (n - 3))), _FINEST_M)
-    if plan >= SIGMA_M[0] or height >= SIGMA_M[2]:
-        return None
-    stations = placed.block.stations
-    sigma = np.array([plan, plan, height])[np.asarray(stations.axis)]
-    block = dataclasses.replace(placed.block, stations=dataclasses.replace(stations, sigma=sigma))
-    message = (
-        f"positions scatter by {plan:.2g} m in plan and {height:.2g} m in height; used as their standard deviations, "
-        "as larger ones would leave the rotation of this small block undetermined"
-    )
-    return placed._replace(block=block, sentences=(*placed.sentences, message))
-
-
-def with_fixed_datum(placed: GeoreferencedPhotographs, datum: Datum) -> GeoreferencedPhotographs | None:
-    """Define the datum of the georeferenced block by `datum` instead of stations.
-
-    Return None if positions determine the rotation worse than 17 degrees, unless the strip is assumed level.
-    """
-    stations = placed.block.stations
-    here, sigma = (np.asarray(v, float).reshape(-1, 3) for v in (stations.value, stations.sigma))
-    if not (placed.level or _rotation_sigma(here, sigma) <= _FIXED_RAD):
-        return None
+def with_fixed_datum(placed: GeoreferencedPhotographs, datum: Datum) -> GeoreferencedPhotographs:
+    """Define the datum of the georeferenced block by `datum` instead of stations."""
     return placed._replace(block=without_stations(dataclasses.replace(placed.block, datum=datum)))
-
-
-class _Fit(NamedTuple):
-    """Similarity, the positions that agree with it, and the source of the rotation if positions do not determine it."""
-
-    similarity: Similarity
-    used: np.ndarray
-    helping: RecordedRotation | None = None
-    level: bool = False
-    """True if the rotation about the line of a strip is assumed."""
-
-
-def _fit(
-    block: Block,
-    image: np.ndarray,
-    here: Float[np.ndarray, "n 3"],
-    sigmas: Float[np.ndarray, "n 3"],
-    own_sigmas: Float[np.ndarray, "n 3"],
-    recorded: RecordedRotation | str | None,
-) -> _Fit:
-    """Fit the network to positions `here`, with attitudes if these determine the rotation better."""
-    exterior = block.start.unknowns.exterior
-    there = np.asarray(exterior.position, float)[image]
-    if isinstance(recorded, RecordedRotation):
-        similarity, used = _fit_with_rotation(there, here, recorded.turn, own_sigmas)
-        if recorded.turn_sigma_rad < _rotation_sigma(here[used], sigmas[used]):
-            return _Fit(similarity, used, recorded)
-    elif is_line(there):
-        turn = level_rotation(there, here, np.asarray(exterior.camera_from_object, float)[:, 2])
-        similarity, used = _fit_with_rotation(there, here, turn, own_sigmas)
-        if not _rotation_sigma(here[used], sigmas[used]) <= _FIXED_RAD:
-            return _Fit(similarity, used, level=True)
-    return _Fit(*_fit_by_positions(there, here, own_sigmas))
 
 
 def _check_upright(block: Block, similarity: Similarity) -> None:
@@ -232,16 +317,14 @@ def _check_upright(block: Block, similarity: Similarity) -> None:
         )
 
 
-def _rotation_sigma(here: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"]) -> float:
-    """Return the standard deviation (rad) of the rotation about the longest direction of the positions.
+def _rotation_sigma(network: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"]) -> float:
+    """Return the standard deviation (rad) of the rotation about the longest direction of the projection centres.
 
-    It follows from their extent across that direction.
+    It follows from the standard deviations of the positions and the extent of the network across that direction.
     """
-    across = np.linalg.svd(here - np.median(here, axis=0), compute_uv=False)
-    # The extent includes the scatter of the positions: remove it.
+    across = np.linalg.svd(network - network.mean(axis=0), compute_uv=False)
     noise = float(np.sqrt(np.mean(np.median(sigma, axis=0) ** 2)))
-    apart = np.sqrt(max(across[1] ** 2 - len(here) * noise**2, 0.0)) if len(across) > 1 else 0.0
-    return noise / apart if apart > 0 else np.inf
+    return noise / float(across[1]) if len(across) > 1 and across[1] > 0 else np.inf
 
 
 def _fit_with_rotation(
@@ -360,57 +443,6 @@ def _optimise_similarity(shift, matrix, scale, there, here, weight, turn, turn_w
     return at(least_squares(residuals, jnp.zeros(7), damping=1e-6).unknowns)
 
 
-LEVEL_DEG = 5.0
-"""Standard deviation (degrees) of the mean roll of a nadir strip (assumed)."""
-# Maximum ratio of width to length of a line.
-_NARROW = 0.1
-
-
-def is_line(centres: Float[np.ndarray, "n 3"]) -> bool:
-    """Return True if projection centres lie on a line."""
-    across = np.linalg.svd(centres - centres.mean(axis=0), compute_uv=False)
-    return bool(across[1] < _NARROW * across[0])
-
-
-def level_rotation(
-    centres: Float[np.ndarray, "n 3"], positions: Float[np.ndarray, "n 3"], backwards: Float[np.ndarray, "m 3"]
-) -> Float[np.ndarray, "3 3"]:
-    """Return the rotation of a network to a level frame: its line is mapped to the line of the `positions`.
-
-    The rotation about the line makes the images as vertical as possible on average. `backwards` are the camera axes of
-    the network opposite to the viewing directions.
-    """
-    one, other = _axes(_line(centres), backwards.mean(axis=0)), _axes(_line(positions), np.array([0.0, 0.0, 1.0]))
-    return other @ one.T
-
-
-def _line(places: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "3"]:
-    """Return the direction from the first to the last positions, by medians (robust to single outliers)."""
-    half = len(places) // 2
-    apart = places[half:] - places[: len(places) - half]
-    return np.median(apart, axis=0)
-
-
-def _axes(along: Float[np.ndarray, "3"], up: Float[np.ndarray, "3"]) -> Float[np.ndarray, "3 3"]:
-    """Return the axes along, across and up, as columns."""
-    x = along / np.linalg.norm(along)
-    y = np.cross(up, x)
-    y /= np.linalg.norm(y)
-    return np.stack([x, y, np.cross(x, y)], axis=1)
-
-
-# Maximum relative difference of equal height offsets; minimum of such an offset (m).
-_EQUAL, _ZERO_M = 0.1, 10.0
-# Minimum ratio of the height offset to the offset in plan.
-_HEIGHT_RATIO = 4.0
-
-LEVEL_MESSAGE = (
-    "positions on one line leave the rotation about it undetermined: photographs are assumed to look down on average, "
-    f"to about {LEVEL_DEG:g} degrees, and heights tilt across the line by as much; attitudes, a cross strip or control "
-    "points would determine it"
-)
-
-
 def position_messages(
     system: str,
     images: Sequence[str],
@@ -436,27 +468,12 @@ def position_messages(
             f"{stated.count(False)} positions have no standard deviation in their files: assumed {east:.2g} m east and "
             f"north, {up:.2g} m up"
         )
-    names = np.array(list(positions), object)
-    high = ~used & _other_height_datum(offsets, used)
-    if high.any():
-        yield (
-            f"the heights of {high.sum()} photographs ({few(names[high].tolist())}) all differ by "
-            f"{np.median(offsets[high, 2]):+.0f} m from the others: another height datum, such as take-off; rejected"
-        )
-    for name, offset in zip(names[~used & ~high], offsets[~used & ~high], strict=True):
+    names = np.array(list(positions), object)[~used]
+    for name, offset in list(zip(names, offsets[~used], strict=True))[:_LISTED]:
         components = ", ".join(f"{v:z.1f}" for v in offset)
         yield f"the position of {name} differs by {components} m (east, north, up) from the others: rejected"
-
-
-def _other_height_datum(offsets: np.ndarray, used: np.ndarray) -> np.ndarray:
-    """Mark rejected positions, two or more, that have the same height offset and no offset in plan."""
-    plan = np.hypot(*offsets[:, :2].T)
-    level = ~used & (np.abs(offsets[:, 2]) > np.maximum(_ZERO_M, _HEIGHT_RATIO * plan))
-    if level.sum() < 2:
-        return np.zeros(len(offsets), bool)
-    middle = float(np.median(offsets[level, 2]))
-    equal = level & (np.abs(offsets[:, 2] - middle) <= max(_EQUAL * abs(middle), 2 * _EQUAL * _ZERO_M))
-    return equal if equal.sum() >= 2 else np.zeros(len(offsets), bool)
+    if len(names) > _LISTED:
+        yield f"{len(names) - _LISTED} more positions are rejected: {few(names[_LISTED:].tolist())}"
 
 
 def attitude_messages(
@@ -472,11 +489,6 @@ def attitude_messages(
     apart = np.rad2deg(np.linalg.norm(scipy.spatial.transform.Rotation.from_matrix(turn @ recorded.turn.T).as_rotvec()))
     scatter, boresight = np.rad2deg([recorded.scatter_rad, recorded.turn_sigma_rad])
     words = f"{len(recorded.image)} recorded attitudes agree with one another to {scatter:.2g} degrees"
-    if recorded.quarters:
-        yield (
-            f"the pictures are turned by {90 * recorded.quarters} degrees clockwise relative to the attitudes of their "
-            "files, according to the positions: attitudes were turned likewise"
-        )
     if used:
         yield (
             f"{words}; positions determine the rotation of the block less well: attitudes are observed, with a common "

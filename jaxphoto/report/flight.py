@@ -130,7 +130,6 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
     if part.why_not and not part.controlled:
         frame = "is placed by its positions, but not constrained by them" if part.placed else "has an arbitrary frame"
         yield Finding("own_frame", "warning", part.why_not, numbers={"frame": frame})
-    yield from (Finding("message", "warning", sentence) for sentence in (part.placed.steps if part.placed else ()))
     if part.placed and not part.placed.used.all():
         used = part.placed.used
         yield Finding("positions_rejected", "warning", value=int((~used).sum()), numbers={"n": len(used)})

@@ -44,7 +44,6 @@ GIVEN = {
     "docs/clouds.md": Given("made_photographs blank PHOTO\n"),
     "docs/command_line.md": Given(_BLOCK),
     "docs/control.md": Given(_FLIGHT + "jaxphoto orient PHOTOGRAPHS/*.jpg --out BLOCK\n"),
-    "docs/formats.md": Given(_FLIGHT, {"CAMERA_OR_RESULTS": "PHOTOGRAPHS.toml"}),
     "docs/photographs.md": Given(_FLIGHT),
     "docs/solver.md": Given(_BLOCK + "cp -r BLOCK block\necho 'import jaxphoto' > my_script.py\n"),
     "docs/statistics.md": Given(_BLOCK),

@@ -6,8 +6,8 @@ from pathlib import Path
 import pytest
 
 from jaxphoto.extras.formats import CAMERAS_WRITTEN, CONTROL_FORMATS, EXPORTS, FORMATS, export, recognise
+from jaxphoto.io import exposures
 from jaxphoto.io.camera_files import CAMERA_READERS
-from jaxphoto.io.exposures import files
 from jaxphoto.io.trajectory import is_sbet
 from tests import sound_files
 from tests.io import (
@@ -48,7 +48,7 @@ DECLARED = {
         *(("convert", name) for name in FORMATS),
         *(("camera", name) for name in CAMERA_READERS),
         *(("control", name) for name in (*CONTROL_FORMATS, "tables")),
-        *(("exposures", name) for name in (*files.SUFFIXES, *files.NAMES)),
+        *(("exposures", name) for name in (*exposures.SUFFIXES, *exposures.NAMES)),
         *SBET,
         ("trajectory", ".csv"),
         *CLOUDS,

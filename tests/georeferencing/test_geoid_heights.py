@@ -11,9 +11,8 @@ from pyproj import datadir
 
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import map_frame
-from jaxphoto.georeferencing.gps import Gps
-from jaxphoto.georeferencing.recorded_positions import one_height
-from jaxphoto.procedures.control.frame import in_frame
+from jaxphoto.georeferencing.recorded_positions import Gps, one_height
+from jaxphoto.procedures.control.control_block import in_frame
 from jaxphoto.procedures.georeference_photographs import georeference_photographs
 from jaxphoto_command.photographs import height_reference
 from tests.procedures.controlled import CODE, marked_block
@@ -50,13 +49,6 @@ def test_the_geoid_is_added_to_what_is_not_above_the_ellipsoid(geoid):
         f"{UNDULATION_M:+.2f} m, is added"
     ]
     assert "the files give all above the ellipsoid" in one_height({"c": given["c"]}, {}, EGM96)[1][1]
-
-
-def test_heights_above_take_off_among_them_are_brought_to_them_first(geoid):
-    above = {"a": 60.0, "b": 61.0, "c": 60.5}
-    given = {n: HERE._replace(altitude_m=40 + h) for n, h in above.items()} | {"c": HERE._replace(altitude_m=60.5)}
-    found, _ = one_height(given, above, EGM96)
-    assert [g.altitude_m for g in found.values()] == pytest.approx([40 + UNDULATION_M + h for h in above.values()])
 
 
 def test_a_block_has_heights_above_the_geoid_in_its_files(geoid):

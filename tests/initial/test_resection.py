@@ -3,8 +3,7 @@ import pytest
 
 from jaxphoto.camera import Brown, InteriorOrientation
 from jaxphoto.errors import BlockError
-from jaxphoto.initial.resection import resect
-from jaxphoto.initial.three_points import three_point_resections
+from jaxphoto.initial.resection import resect, three_point_resections
 from tests.formulas import camera_from_object, random_rotations
 from tests.initial.scene import K1, C, ideal_images, measured
 

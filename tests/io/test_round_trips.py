@@ -5,7 +5,6 @@ import numpy as np
 import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
-from pyproj import Transformer
 
 from jaxphoto.camera import DISTORTIONS, PROJECTIONS, InteriorOrientation, Sensor, get_parameter, parameter_names
 from jaxphoto.cloud import Cloud
@@ -16,7 +15,7 @@ from jaxphoto.io.camera_files import read_camera_file
 from jaxphoto.io.exposures import read_exposures
 from jaxphoto.io.trajectory import FIELDS, Records, read_records, read_sbet, write_flight_csv, write_sbet
 from tests.formulas import camera_from_object
-from tests.io.test_exports import EPSG, photographs
+from tests.io.test_exports import photographs
 
 few = settings(max_examples=6, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
 SENSOR = Sensor(4500, 3000, 0.008)
@@ -188,20 +187,3 @@ def test_an_sbet_comes_back_as_records_and_as_exposures(tmp_path, seed, wander):
     np.testing.assert_array_equal(back.time, wanted.time)
     np.testing.assert_array_equal(exposures.place, back.coordinates)
     np.testing.assert_array_equal(exposures.aircraft_deg, back.roll_pitch_yaw_deg)
-
-
-@few
-@given(poses=poses)
-def test_exported_exposures_round_trip(tmp_path_factory, poses):
-    values = np.array(poses)
-    turn = np.stack([camera_from_object(*angles) for angles in values[:, 3:]])
-    p = photographs("opencv")._replace(exterior=ExteriorOrientation(values[:, :3], turn))
-    folder = tmp_path_factory.mktemp("opk")
-    export(p, folder, "opk")
-    back = read_exposures(folder / "exterior.txt")
-    wanted = p.frame.map.map(values[:, :3])
-    to_map = Transformer.from_crs(4326, EPSG, always_xy=True)
-    # A northing has nine digits before those of a nanometre.
-    close(np.stack(to_map.transform(*back.place[:, :2].T), axis=1), wanted[:, :2], rtol=0, atol=1e-8)
-    close(back.place[:, 2], wanted[:, 2], rtol=0, atol=1e-8)
-    assert list(back.names) == [name.rsplit(".", 1)[0] for name in p.files]

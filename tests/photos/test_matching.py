@@ -9,10 +9,9 @@ import pytest
 
 from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.features import FEATURES, OF_FEW
-from jaxphoto.extras.photos.matching import match_photographs, tie_features
-from jaxphoto.extras.photos.photograph_pairs import nearest_pairs, photograph_pairs
-from jaxphoto.georeferencing.gps import Gps
-from jaxphoto.initial.matches import PairMatches, connected_images, tracks
+from jaxphoto.extras.photos.matching import match_photographs, nearest_pairs, photograph_pairs
+from jaxphoto.georeferencing.recorded_positions import Gps
+from jaxphoto.initial.matches import PairMatches, connected_images
 from jaxphoto.io.photographs import photographs, sensor_and_interior
 from tests.photos.ground import C_MM, SENSOR, mapped, photograph, texture
 
@@ -114,20 +113,6 @@ def test_matches_are_counted_and_the_same_again(taken):
     assert matched.n_gross == (alike - kept).sum()
 
 
-def test_points_of_several_photographs(taken):
-    """Every row must be where the map of its photograph puts the point."""
-    images, camera, matrices, _ = taken
-    found = tie_features([p.path for p in images[:3]], camera.sensor, least_photographs=3)
-    counts = np.bincount(found.point)
-    assert len(counts) > 400 and (counts == 3).all()
-    np.testing.assert_array_equal(found.photograph, np.tile([0, 1, 2], len(counts)))
-    px = SENSOR.px_from_mm(found.xy_mm) - 0.5
-    on_ground = np.stack([mapped(np.linalg.inv(matrices[k]), px[k::3]) for k in range(3)])
-    off = np.linalg.norm(on_ground - on_ground.mean(axis=0), axis=2).max(axis=0)
-    # A pixel is 0.1 m on the ground.
-    assert np.median(off) < 0.02 and np.mean(off > 0.1) < 0.02
-
-
 def test_pairs_are_chosen(taken):
     images = taken[0]
     assert photograph_pairs(images) == list(itertools.combinations(range(4), 2))
@@ -149,42 +134,7 @@ def test_pairs_are_chosen(taken):
         photograph_pairs(images, "position:3")
 
 
-def test_tracks_join_matches_and_survive_false_ones():
-    """A tenth of the matches false: nearly all points stay whole, and no photograph shows one twice."""
-    rng = np.random.default_rng(6)
-    n_images, n_points = 8, 200
-    # Feature k of an image is point order[k].
-    orders = [rng.permutation(n_points) for _ in range(n_images)]
-    places = [np.argsort(order) for order in orders]
-    pairs, false = [], 0
-    for a, b in itertools.combinations(range(n_images), 2):
-        seen = rng.permutation(n_points)[:120]
-        partner = seen.copy()
-        partner[:12] = np.roll(seen[:12], 1)
-        false += 12
-        pairs.append(PairMatches(a, b, np.column_stack([places[a][seen], places[b][partner]])))
-    image, feature, point, n_conflicting = tracks([n_points] * n_images, pairs)
-    assert len(set(zip(image.tolist(), point.tolist(), strict=True))) == len(image)
-    assert len(set(zip(image.tolist(), feature.tolist(), strict=True))) == len(image)
-    true = np.array([orders[i][f] for i, f in zip(image, feature, strict=True)])
-    # The true point that most features of a track are of; the share of features that are of another.
-    wrong = sum((true[point == p] != np.bincount(true[point == p]).argmax()).sum() for p in np.unique(point))
-    assert wrong / len(point) < 0.02
-    assert len(point) > 0.97 * n_images * n_points
-    assert 0.8 * false < n_conflicting < 1.2 * false
-    np.testing.assert_array_equal(np.unique(point), np.arange(point.max() + 1))
-    assert (np.diff(point * n_images + image) > 0).all()
-
-
-def test_tracks_of_little():
-    none = tracks([3, 3], [])
-    assert len(none.point) == 0 and none.n_conflicting == 0
-    one = tracks([3, 3, 1], [PairMatches(0, 1, np.array([[2, 0]])), PairMatches(1, 2, np.array([[0, 0]]))])
-    np.testing.assert_array_equal([one.image, one.feature, one.point], [[0, 1, 2], [2, 0, 0], [0, 0, 0]])
-    with pytest.raises(ValueError, match="first < second"):
-        tracks([3, 3], [PairMatches(1, 0, np.array([[0, 0]]))])
-    with pytest.raises(ValueError, match="features out of range"):
-        tracks([3, 3], [PairMatches(0, 1, np.array([[0, 3]]))])
+def test_connected_images():
     joined = connected_images(5, [PairMatches(1, 3, np.array([[0, 0]])), PairMatches(3, 4, np.array([[0, 0]]))])
     assert [group.tolist() for group in joined] == [[1, 3, 4], [0], [2]]
 
@@ -210,8 +160,6 @@ def test_photographs_that_do_not_hang_together(taken, elsewhere):
     apart = photographs([near[0], elsewhere[0]])
     with pytest.raises(InputError, match=r"no two of the 2 photographs \(0.png, far0.png\) have 15 points in common"):
         match_photographs(apart, camera.sensor, camera.interior, [(0, 1)], count=800)
-    with pytest.raises(InputError, match="the 2 photographs have no point in common"):
-        tie_features([p.path for p in apart], camera.sensor, count=800)
 
 
 def test_photographs_that_match_no_other_one_are_left_out_by_name(taken, elsewhere, tmp_path):

@@ -5,9 +5,9 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxphoto.camera import InteriorOrientation, Sensor
-from jaxphoto.initial.matches import PairMatches, tracks
+from jaxphoto.initial.matches import PairMatches
+from jaxphoto.procedures.orientation.blocks import similarity_between
 from jaxphoto.procedures.orientation.colmap import Network
-from jaxphoto.procedures.orientation.known_frame import similarity_between
 from jaxphoto.procedures.orientation.orient_photographs import network_block
 from jaxphoto.statistics import covariance
 from tests.formulas import camera_from_object
@@ -175,12 +175,23 @@ def with_epipolar_matches(photographs, per_pair, noise_px=0.3, seed=7):
 
 def true_network(p):
     """The network at the truth, and the true point of each of its rows; -1 for a false one."""
-    scene, found = p.scene, tracks([len(xy) for xy in p.features], p.matches)
-    true = np.array([p.point_of[i][f] for i, f in zip(found.image, found.feature, strict=True)])
-    points = np.zeros((int(found.point.max()) + 1, 3))
-    points[found.point] = scene.points[true]
+    scene, group, edges = p.scene, dict[tuple, set](), []
+    for i, j, features in p.matches:
+        edges += [((i, a), (j, b)) for a, b in features.tolist()]
+    # True matches first; none may show a point twice in an image.
+    for one, other in sorted(
+        edges, key=lambda e: (p.point_of[e[0][0]][e[0][1]] < 0) + (p.point_of[e[1][0]][e[1][1]] < 0)
+    ):
+        a, b = group.setdefault(one, {one}), group.setdefault(other, {other})
+        if a is not b and not {i for i, _ in a} & {i for i, _ in b}:
+            a |= b
+            group |= dict.fromkeys(b, a)
+    joined = {id(members): sorted(members) for members in group.values() if len(members) > 1}
+    rows = np.array([(i, f, k) for k, members in enumerate(joined.values()) for i, f in members]).T
+    true = np.array([p.point_of[i][f] for i, f in rows[:2].T])
+    points = np.zeros((len(joined), 3))
+    points[rows[2]] = scene.points[true]
     n = len(p.names)
-    rows = (found.image, found.feature, found.point)
     places = (scene.positions.copy(), scene.matrices.copy(), np.ones(n, bool), tuple(range(n)), points)
     return Network(*places, *rows, (p.camera.c / PIXEL,), tuple(p.matches)), true
 

@@ -15,8 +15,7 @@ from jaxphoto.procedures.calibration import (
     free_parameters,
     target_calibration,
 )
-from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion
-from jaxphoto.procedures.calibration.target_block import projections
+from jaxphoto.procedures.calibration.start import flat_start, nearest_distortion, projections
 from jaxphoto.procedures.calibration.target_calibration import added_sigma, eccentricities
 from jaxphoto.report.photographs import findings
 from tests.derivatives import compiled
@@ -138,13 +137,13 @@ def test_too_few_targets_in_every_photograph_are_said():
 def test_start_needs_nothing_but_tilted_views():
     board = flat_board()
     pairs = [(board.xyz_m[d.point, :2], SENSOR.mm_from_px(d.column_row)) for d in seen(board, views(board, 6), 0.2)]
-    start, told = flat_start(pairs, SENSOR)
+    start, told = flat_start(pairs, SENSOR, 8.0)
     assert told
     assert float(start.c) == pytest.approx(float(WIDE.c), rel=0.05)
     # From straight above nothing tells c from the height.
     above = ExteriorOrientation(np.array([0.12, -0.09, 0.2]), np.eye(3))  # type: ignore[arg-type]
     level = [(board.xyz_m[d.point, :2], SENSOR.mm_from_px(d.column_row)) for d in seen(board, [above] * 3, 0.0)]
-    assert not flat_start(level, SENSOR)[1]
+    assert not flat_start(level, SENSOR, 8.0)[1]
 
 
 def test_views_of_one_row_do_not_spoil_the_start():
@@ -157,11 +156,11 @@ def test_views_of_one_row_do_not_spoil_the_start():
         [(board.xyz_m[d.point, :2], SENSOR.mm_from_px(d.column_row)) for d in some]
         for some in (detections, row, beside)
     )
-    start, _ = flat_start(pairs, SENSOR)
-    spoilt, told = flat_start(pairs + rows + more, SENSOR)
+    start, _ = flat_start(pairs, SENSOR, 8.0)
+    spoilt, told = flat_start(pairs + rows + more, SENSOR, 8.0)
     assert told
-    assert float(spoilt.c) == float(start.c)
-    assert not flat_start(rows + more, SENSOR)[1]
+    assert float(spoilt.c) == pytest.approx(float(start.c), rel=1e-9)
+    assert not flat_start(rows + more, SENSOR, 8.0)[1]
 
 
 def test_rounds_that_do_not_come_to_rest_are_said(monkeypatch):

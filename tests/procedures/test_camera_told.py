@@ -10,7 +10,7 @@ from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.observations import ImagePoints
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.orientation import orient
-from jaxphoto.procedures.orientation.self_calibration import correlation_factor
+from jaxphoto.procedures.orientation.orient_photographs import correlation_factor
 from tests.blocks import example
 from tests.marks import slow_but
 from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, errors_with_covariance, photographed, projected

@@ -10,11 +10,10 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.observations import CameraPositions
 from jaxphoto.procedures.control import GivenControl, Marks, at_optimum, control_block
-from jaxphoto.procedures.control.frame import onto_control
 from jaxphoto.procedures.control.marks import without_names
 from jaxphoto.simulation import image_coordinates
 from tests.blocks import free_network, simulated
-from tests.procedures.controlled import CHECK, CODE, CONTROL, ORIGIN, TURN, marked_block
+from tests.procedures.controlled import CHECK, CODE, CONTROL, ORIGIN, marked_block
 
 
 @pytest.fixture(scope="module")
@@ -130,37 +129,6 @@ def test_a_blunder_that_the_places_hide_is_found_by_the_adjustment(marked):
     assert len(check) == 3 * len(CHECK) and not np.asarray(check.sigma).any()
 
 
-def test_points_of_a_hand_held_receiver_are_taken_for_what_they_are(marked):
-    """Nobody says that they were surveyed to 1.5 m: their scatter does, and one that is far off is found still."""
-    points, rng = marked.control.points, np.random.default_rng(2)
-    all_control = points._replace(sigma_m=np.full_like(points.sigma_m, np.nan), check=np.zeros(len(points.ids), bool))
-    for far in (0.0, 30.0):
-        xyz = points.coordinates + rng.normal(scale=1.5, size=points.coordinates.shape)
-        xyz[1, 0] += far
-        found = found_in(marked, marked.control._replace(points=all_control._replace(coordinates=xyz)))
-        left = "left out" if far else "control"
-        assert found.state == tuple(left if k == 1 else "control" for k in range(len(points.ids)))
-        (said,) = (s for s in found.sentences if "they scatter about the photographs" in s)
-        east, _, up = found.survey_sigma_m[0]
-        assert 0.8 < east < 2.5 and f"{east:.2g} m east and north, {up:.2g} m up are assumed" in said
-        off = in_true_frame(found) - marked.true_xyz
-        assert np.abs(off / found.sigma_m).max() < 4.5 and np.sqrt(np.mean((off / found.sigma_m) ** 2)) < 1.8
-
-
-@pytest.mark.parametrize("sigma_m", [0.05, 0.5])
-def test_poorly_surveyed_points_of_a_small_site_still_bring_the_block(sigma_m):
-    """Where most points are off by more than a block is bent by, those that agree by chance must not be all of it."""
-    rng, assumed = np.random.default_rng(4), np.ones(12, bool)
-    there = rng.uniform(-1, 1, (12, 3)) * (1, 1, 0.2)
-    here = 10 * there @ TURN.T + (100, 200, 300) + rng.normal(0, sigma_m, there.shape)
-    here[5] += (4.0, 0.0, 0.0)
-    found = onto_control(there, here, np.full(12, 0.04), "control.csv", assumed)
-    assert not found.agree[5] and found.agree.sum() >= 10
-    assert found.scatter_m is None if sigma_m < 0.1 else 0.3 < found.scatter_m < 0.8
-    off = found.similarity.of(there) - (10 * there @ TURN.T + (100, 200, 300))
-    assert np.sqrt(np.mean(off**2)) < sigma_m
-
-
 def test_heights_that_nobody_surveyed_cost_a_sentence(marked):
     xyz = marked.control.points.coordinates.copy()
     xyz[:, 2] = 0.0
@@ -183,8 +151,7 @@ def test_exchanged_names_are_seen(marked):
     xyz[[0, 4]] = xyz[[4, 0]]
     found = found_in(marked, with_coordinates(marked.control, xyz))
     said = " ".join(found.sentences)
-    for one, other in (("G0", "G32"), ("G32", "G0")):
-        assert f"control point {one} contradicts" in said and f"its marks show {other}" in said
+    assert "control point G0 contradicts" in said and "control point G32 contradicts" in said
 
 
 def test_marks_that_cannot_be_used_cost_a_sentence(marked):

@@ -5,11 +5,10 @@ import pytest
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import InputError
-from jaxphoto.georeferencing.gps import Gps
-from jaxphoto.procedures.control.of_flight import flight_control
+from jaxphoto.georeferencing.recorded_positions import Gps
+from jaxphoto.initial.matches import MatchedPart
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
-from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
-from jaxphoto.procedures.matched_part import MatchedPart
+from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight, flight_control
 from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, photographed, projected
 
 LENS = Camera(8.0, 0.04, -0.03, 1e-4, -1e-6)

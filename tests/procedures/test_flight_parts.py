@@ -4,9 +4,8 @@ import numpy as np
 import pytest
 
 from jaxphoto.camera import InteriorOrientation
-from jaxphoto.initial.matches import PairMatches
+from jaxphoto.initial.matches import MatchedPart, PairMatches
 from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight
-from jaxphoto.procedures.matched_part import MatchedPart
 from tests.procedures.orientable import PIXEL, SENSOR, Camera, aerial, photographed
 
 pytest.importorskip("pycolmap", reason="pycolmap, which orients images, is not installed (extra photos)")

@@ -12,7 +12,7 @@ from jaxphoto.errors import BlockError, GroupsError
 from jaxphoto.initial.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.orientation import orient
-from jaxphoto.procedures.orientation.self_calibration import shared_covariance
+from jaxphoto.procedures.orientation.orient_photographs import shared_covariance
 from jaxphoto.unknowns import FIXED, Weighted
 from tests.procedures.orientable import (
     PIXEL,

@@ -12,7 +12,7 @@ from jaxphoto.initial.approximate import completed
 from jaxphoto.observations import CameraPositions, ControlCoordinates, ImagePoints
 from jaxphoto.procedures.adjust import adjust, needs_orientation, start_of
 from jaxphoto.procedures.orientation import orient_block
-from jaxphoto.procedures.orientation.self_calibration import freed
+from jaxphoto.procedures.orientation.orient_photographs import freed
 from tests.formulas import camera_from_object
 from tests.procedures.orientable import Camera, aerial, block_of, convergent, photographed, true_network
 

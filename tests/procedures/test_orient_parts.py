@@ -12,9 +12,8 @@ from jaxphoto.errors import BlockError
 from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.initial.rays import ideal_coordinates, turn_to_object, unit_rays
 from jaxphoto.observations import CameraPositions, Distances
-from jaxphoto.procedures.orientation.known_frame import in_known_frame, similarity_between
-from jaxphoto.procedures.orientation.rejection import beyond_limit, unsupported
-from jaxphoto.procedures.orientation.self_calibration import corner_shift, undetermined
+from jaxphoto.procedures.orientation.blocks import in_known_frame, similarity_between
+from jaxphoto.procedures.orientation.orient_photographs import beyond_limit, corner_shift, undetermined, unsupported
 from tests.formulas import camera_from_object
 from tests.procedures.orientable import (
     Camera,

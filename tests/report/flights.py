@@ -8,9 +8,9 @@ import pandas as pd
 from jaxphoto import Tables
 from jaxphoto.adjustment import MINIMAL_SIZES
 from jaxphoto.camera.conditions import Conditions
+from jaxphoto.initial.matches import MatchedPart
 from jaxphoto.procedures.flight import FlightPart
 from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotographs
-from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation import Oriented
 from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport
 from jaxphoto.report.findings import Finding, Verdict

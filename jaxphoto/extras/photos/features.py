@@ -1,4 +1,4 @@
-"""Grey values of photographs, and feature detection by OpenCV: evenly distributed corners and SIFT features."""
+"""Grey values of photographs, and SIFT features by OpenCV."""
 
 from pathlib import Path
 from typing import NamedTuple
@@ -44,12 +44,6 @@ OF_FEW = 10_000
 """Default maximum number of features per photograph for few photographs, limited by memory."""
 LONGEST_PX = 2400
 """Default longer side (px) of a photograph for feature detection. Memory: 1 GB (3200: 1.7 GB)."""
-# Minimum ratio of a corner's strength to the strongest corner's.
-_WEAKEST = 0.01
-# Half width (px) of the window for subpixel refinement of a corner (11 px in total).
-_HALF_WINDOW = 5
-_BORDER_PX = 8
-_CELLS = 16
 # A third of OpenCV's default: fields and walls have low contrast.
 _CONTRAST = 0.0133
 # Norm of a SIFT descriptor before rounding; nearly all components are then less than 256.
@@ -57,17 +51,6 @@ _LENGTH = 512
 # Standard deviation (px) of a feature of width 0, and its increase per pixel of width.
 _SIGMA_PX = 0.07
 _SIGMA_OF_WIDTH = 0.025
-METHOD = (1, _CONTRAST, _SIGMA_PX, _SIGMA_OF_WIDTH)
-"""Cache key of features; increment the first element when the detection changes."""
-
-
-class Features(NamedTuple):
-    """Interest points of a photograph."""
-
-    xy_mm: Float[np.ndarray, "n 2"]
-    """Measured image coordinates, from the image centre, x right, y up."""
-    strength: Float[np.ndarray, "n"]
-    """Smaller eigenvalue of the gradient matrix (Shi and Tomasi, 1994), divided by the strongest corner's."""
 
 
 class SiftFeatures(NamedTuple):
@@ -81,37 +64,6 @@ class SiftFeatures(NamedTuple):
     """Feature index of each descriptor; a feature with several dominant directions has several descriptors."""
     descriptors: UInt8[np.ndarray, "m 128"]
     """Square roots of the SIFT histograms (RootSIFT), scaled to norm 512."""
-
-
-def interest_points(photograph: Path, sensor: Sensor, count: int) -> Features:
-    """Detect up to `count` corners of a photograph with subpixel accuracy, evenly distributed over the format.
-
-    Uses Shi and Tomasi's good features to track. The strongest corner of each cell of a grid is selected, then the
-    second, and so on. Raises InputError for a file that is not an image or not of the sensor's size, and for a
-    photograph without corners.
-    """
-    picture = _read(photograph, sensor)
-    quality = cv2.cornerMinEigenVal(picture, 3)
-    apart = max(3, int(0.5 * np.sqrt(sensor.width_px * sensor.height_px / max(count, 1))))
-    # Detect ten times as many candidates at half the distance of an even distribution.
-    candidates = cv2.goodFeaturesToTrack(picture, 10 * count, _WEAKEST, min(apart, 20))
-    if candidates is None:
-        raise InputError(f"{photograph}: no interest point found; the picture is blank or out of focus")
-    corners = candidates.reshape(-1, 2)
-    border = np.minimum(corners, [sensor.width_px - 1, sensor.height_px - 1] - corners).min(axis=1)
-    corners = corners[border >= _BORDER_PX]
-    strength = quality[corners[:, 1].astype(int), corners[:, 0].astype(int)]
-    chosen = _spread(corners, strength, sensor, count)
-    corners, strength = corners[chosen], strength[chosen]
-    if not len(corners):
-        raise InputError(f"{photograph}: interest points found only at the border; the picture is nearly blank")
-    until = (cv2.TERM_CRITERIA_EPS + cv2.TERM_CRITERIA_MAX_ITER, 40, 1e-3)
-    fine = cv2.cornerSubPix(picture, corners.reshape(-1, 1, 2).copy(), (_HALF_WINDOW,) * 2, (-1, -1), until)
-    fine = fine.reshape(-1, 2).astype(float)
-    # Reject corners that moved more than the window: they converged to a different corner.
-    stayed = np.abs(fine - corners).max(axis=1) <= _HALF_WINDOW
-    # OpenCV's origin is the centre of the upper left pixel, (0.5, 0.5) in our convention.
-    return Features(sensor.mm_from_px(fine[stayed] + 0.5), (strength[stayed] / quality.max()).astype(float))
 
 
 def sift_features(
@@ -176,14 +128,3 @@ def _read(photograph: Path, sensor: Sensor) -> np.ndarray:
             f"{sensor.height_px}; give the original picture, or its camera"
         )
     return picture
-
-
-def _spread(corners: np.ndarray, strength: np.ndarray, sensor: Sensor, count: int) -> Int[np.ndarray, "n"]:
-    """Select the strongest corner of each grid cell, then the second strongest, and so on, up to `count`."""
-    across = max(1, min(_CELLS, int(np.sqrt(count / 2))))
-    side = max(sensor.width_px, sensor.height_px) / across
-    cell = np.floor(corners / side).astype(int) @ [1, across + 1]
-    order = np.lexsort((-strength, cell))
-    begins = np.flatnonzero(np.diff(cell[order], prepend=-1))
-    rank = np.arange(len(order)) - np.repeat(begins, np.diff(np.append(begins, len(order))))
-    return order[np.lexsort((-strength[order], rank))][:count]

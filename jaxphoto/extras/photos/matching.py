@@ -3,9 +3,11 @@
 COLMAP matches descriptors (mutual nearest neighbours with Lowe's ratio test) and verifies pairs by the inliers of a
 fundamental matrix or homography. Neither requires the principal distance. The EXIF value may be wrong by a third, so an
 essential matrix would reject correct matches.
+
+Similarity is the number of matches of the few widest features. It costs a thousandth of matching all features; wide
+features are visible at all image scales (Wu 2013, Towards linear-time incremental structure from motion).
 """
 
-import contextlib
 import itertools
 import os
 import tempfile
@@ -16,19 +18,142 @@ from typing import Any, NamedTuple
 
 import cv2
 import numpy as np
-from jaxtyping import Float, Int
+import scipy
+from jaxtyping import Float, Int, UInt8
 
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.compiling.freed_memory import freed_memory_kept
 from jaxphoto.errors import InputError
-from jaxphoto.extras.photos.features import LONGEST_PX, METHOD, SiftFeatures, sift_features
-from jaxphoto.extras.photos.photograph_pairs import MostSimilar, largest_of, most_similar, usual_count
-from jaxphoto.initial.matches import PairMatches, connected_images, tracks
+from jaxphoto.extras.photos.features import FEATURES, LONGEST_PX, OF_FEW, SiftFeatures, sift_features
+from jaxphoto.initial.matches import MatchedPart, PairMatches, connected_images
 from jaxphoto.initial.rays import ideal_coordinates
-from jaxphoto.io.kept_pieces import KeptPieces, name_of
 from jaxphoto.io.photographs import Photograph
-from jaxphoto.procedures.matched_part import MatchedPart
 from jaxphoto.procedures.orientation.colmap import MappedCamera, import_pycolmap, write_database
+
+_EARTH_M = 6_371_000.0
+# Default number of neighbours: contains all overlapping photographs at 80 % end and side overlap.
+_NEAREST = 20
+FEW = 2 * _NEAREST
+"""Maximum number of photographs for which all pairs are matched (with more features each)."""
+
+LARGEST = 300
+"""Number of widest features compared."""
+# Maximum ratio of the nearest to the second nearest distance (Lowe).
+_RATIO = 0.8
+# Number of photographs compared with one photograph in a batch; limits memory.
+_AT_ONCE = 32
+# Minimum number of matches of the widest features; fewer may match by chance.
+_MIN_VOTES = 2
+
+
+class MostSimilar(NamedTuple):
+    """Request for the pairs of each photograph with its `number` most similar photographs."""
+
+    number: int
+
+
+def usual_choice(photographs: Sequence[Photograph]) -> str:
+    """Return the default choice of pairs: all for few photographs, otherwise neighbours by position if known, otherwise
+    similar ones.
+    """
+    if len(photographs) <= FEW:
+        return "exhaustive"
+    return f"{'position' if all(p.gps for p in photographs) else 'similar'}:{_NEAREST}"
+
+
+def usual_count(photographs: int) -> int:
+    """Return the default maximum number of features per photograph for N photographs."""
+    return OF_FEW if photographs <= FEW else FEATURES
+
+
+def photograph_pairs(
+    photographs: Sequence[Photograph], choice: str = "exhaustive"
+) -> list[tuple[int, int]] | MostSimilar:
+    """Return index pairs (first < second) selected by `choice`.
+
+    `exhaustive`: all pairs. `sequence:K`: each photograph with the next K in the given order. `position:K`: each with
+    the K nearest by horizontal EXIF GPS position. `similar:K`: each with the K most similar (selected by
+    `match_photographs`).
+
+    Raises InputError for an invalid choice, and for `position` if a photograph has no position.
+    """
+    name, _, number = choice.partition(":")
+    if name == "exhaustive" and not number:
+        return list(itertools.combinations(range(len(photographs)), 2))
+    if name not in ("sequence", "position", "similar") or not number.isdecimal() or int(number) < 1:
+        raise InputError(
+            f"unknown choice of pairs {choice!r}; give exhaustive, sequence:K, position:K or similar:K with a "
+            "whole number K, for example sequence:10"
+        )
+    if name == "similar":
+        return MostSimilar(int(number))
+    if name == "sequence":
+        n = len(photographs)
+        return [(k, other) for k in range(n) for other in range(k + 1, min(n, k + 1 + int(number)))]
+    without = [p.path.name for p in photographs if p.gps is None]
+    if without:
+        raise InputError(
+            f"{len(without)} photograph(s) have no GPS position in their EXIF ({', '.join(without[:5])}); choose the "
+            "pairs by similar:K, sequence:K or exhaustive"
+        )
+    places = np.deg2rad([(p.gps.longitude_deg, p.gps.latitude_deg) for p in photographs if p.gps])
+    longitude, latitude = places.reshape(-1, 2).T
+    level = np.stack([np.cos(latitude) * np.cos(longitude), np.cos(latitude) * np.sin(longitude), np.sin(latitude)])
+    return nearest_pairs(_EARTH_M * level.T, int(number))
+
+
+def nearest_pairs(positions_m: Float[np.ndarray, "n axes"], count: int) -> list[tuple[int, int]]:
+    """Return index pairs (first < second) in which one is among the `count` nearest of the other."""
+    n = len(positions_m)
+    _, near = scipy.spatial.cKDTree(positions_m).query(positions_m, k=range(1, min(count + 1, n) + 1))
+    return sorted({(min(k, j), max(k, j)) for k in range(n) for j in near[k].tolist() if j != k})
+
+
+def largest_of(features: SiftFeatures) -> UInt8[np.ndarray, "_ 128"]:
+    """Return the descriptors of the `LARGEST` widest features."""
+    width = features.sigma_mm[features.feature]
+    return features.descriptors[np.sort(np.argsort(-width, kind="stable")[:LARGEST])]
+
+
+def most_similar(
+    largest: Sequence[UInt8[np.ndarray, "_ 128"]], count: int, progress: Callable[[int, int], None]
+) -> list[tuple[int, int]]:
+    """Return index pairs (first < second) in which one is among the `count` photographs most similar to the other.
+
+    `largest`: descriptors of up to `LARGEST` widest features per photograph.
+    """
+    n = len(largest)
+    votes = np.zeros((n, n), int)
+    for a in range(n):
+        for begin in range(a + 1, n, _AT_ONCE):
+            part = slice(begin, min(n, begin + _AT_ONCE))
+            votes[a, part] = _votes(largest[a], largest[part])
+        progress(a + 1, n)
+    votes += votes.T
+    order = np.argsort(-votes, axis=1, kind="stable")[:, :count]
+    return sorted({(min(a, b), max(a, b)) for a in range(n) for b in order[a].tolist() if votes[a, b] >= _MIN_VOTES})
+
+
+def _votes(one: UInt8[np.ndarray, "_ 128"], others: Sequence[UInt8[np.ndarray, "_ 128"]]) -> Int[np.ndarray, "others"]:
+    """Count the descriptors of `one` that pass the ratio test in each of `others`."""
+    if len(one) == 0:
+        return np.zeros(len(others), int)
+    # Pad up to LARGEST descriptors at infinite distance.
+    b = np.zeros((len(others), LARGEST, 128), np.float32)
+    square = np.full((len(others), LARGEST), np.inf, np.float32)
+    for k, other in enumerate(others):
+        b[k, : len(other)] = other
+        square[k, : len(other)] = np.square(other.astype(np.float32)).sum(axis=1)
+    a = one.astype(np.float32)
+    apart = square.reshape(-1) - 2 * (a @ b.reshape(-1, 128).T)
+    apart += np.square(a).sum(axis=1)[:, None]
+    apart = apart.reshape(len(a), len(others), LARGEST)
+    nearest = apart.argmin(axis=2)
+    first = np.take_along_axis(apart, nearest[:, :, None], axis=2)
+    np.put_along_axis(apart, nearest[:, :, None], np.inf, axis=2)
+    second = apart.min(axis=2)
+    return ((first[:, :, 0] < _RATIO**2 * second) & np.isfinite(second)).sum(axis=0)
+
 
 MIN_MATCHES = 15
 """Minimum number of verified matches of a pair; fewer may agree by chance."""
@@ -65,27 +190,14 @@ class MatchedPhotographs(NamedTuple):
     """Reason by name of each photograph without matches."""
 
     @property
-    def gross(self) -> Int[np.ndarray, "compared 3"]:
-        """Rows for all compared pairs: first, second, number of rejected matches."""
-        return np.column_stack([self.counts[:, :2], self.counts[:, 2] - self.counts[:, 3]])
-
-    @property
     def n_gross(self) -> int:
         """Total number of rejected matches."""
-        return int(self.gross[:, 2].sum())
+        return int((self.counts[:, 2] - self.counts[:, 3]).sum())
 
     def named(self, names: list[str]) -> MatchedPart:
         """Return the matches with these photograph names, as the input of `calibrate_flight`."""
-        return MatchedPart(names, self.xy_mm, self.sigma_mm, self.pairs, self.gross, self.sigma_factor)
-
-
-class TieFeatures(NamedTuple):
-    """Tie points in several photographs, one row per measurement, sorted by point."""
-
-    photograph: Int[np.ndarray, "rows"]
-    """Index of the photograph."""
-    point: Int[np.ndarray, "rows"]
-    xy_mm: Float[np.ndarray, "rows 2"]
+        gross = np.column_stack([self.counts[:, :2], self.counts[:, 2] - self.counts[:, 3]])
+        return MatchedPart(names, self.xy_mm, self.sigma_mm, self.pairs, gross, self.sigma_factor)
 
 
 def match_photographs(
@@ -97,15 +209,12 @@ def match_photographs(
     count: int | None = None,
     longest_px: int = LONGEST_PX,
     in_parts: bool = False,
-    keep: KeptPieces | None = None,
     progress: Progress = lambda step, done, of: None,
 ) -> MatchedPhotographs:
     """Match SIFT features between photographs of one camera; `pairs` contains index pairs.
 
     `count` limits the features per photograph: default 5,000, or 10,000 for up to 40 photographs. Photographs are
-    reduced to `longest_px`. `interior` is the known camera; only its distortion and principal point are used. Results
-    are stored in the checkpoint `keep`; an interrupted run continues from it.
-
+    reduced to `longest_px`. `interior` is the known camera; only its distortion and principal point are used.
     Photographs without features or matches are in `left_out`.
 
     Raises InputError as `sift_features`, if no two photographs match, and, unless `in_parts`, for unconnected groups;
@@ -113,69 +222,12 @@ def match_photographs(
     """
     if len(photographs) < 2:
         raise InputError("an orientation needs at least two overlapping photographs; give them all")
-    paths = [p.path for p in photographs]
-    matched = _matched(paths, sensor, interior, pairs, count, longest_px, keep, progress)
-    blank = [len(xy) == 0 for xy in matched.xy_mm]
-    alone = _alone([path.name for path in paths], blank, matched.pairs, in_parts)
-    return matched._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
-
-
-def tie_features(
-    paths: list[Path], sensor: Sensor, count: int | None = None, least_photographs: int = 2
-) -> TieFeatures:
-    """Return the tie points of overlapping photographs of one camera.
-
-    All pairs are matched by `match_photographs` and joined by `tracks`; points in fewer than `least_photographs` are
-    omitted. Raises InputError as `sift_features`, and if there is no point in enough photographs.
-    """
-    each = itertools.combinations(range(len(paths)), 2)
-    matched = _matched(paths, sensor, InteriorOrientation(1.0), each, count, LONGEST_PX, None, lambda *step: None)
-    image, feature, point, _ = tracks([len(xy) for xy in matched.xy_mm], matched.pairs)
-    kept = np.bincount(point)[point] >= least_photographs
-    if not kept.any():
-        raise InputError(
-            f"the {len(paths)} photographs have no point in common; give overlapping photographs of the same size"
-        )
-    xy_mm = np.stack([matched.xy_mm[i][f] for i, f in zip(image[kept], feature[kept], strict=True)])
-    return TieFeatures(image[kept], np.unique(point[kept], return_inverse=True)[1], xy_mm)
-
-
-class _PairResult(NamedTuple):
-    """Concatenated results of several pairs."""
-
-    counts: Int[np.ndarray, "pairs 2"]
-    """Descriptor matches and verified matches."""
-    verified: Int[np.ndarray, "verified 2"]
-    off_line: Float[np.ndarray, "verified"]
-    """Distances from the epipolar lines divided by their standard deviations."""
-
-
-def _matched(
-    paths: list[Path],
-    sensor: Sensor,
-    interior: InteriorOrientation,
-    pairs: Iterable[tuple[int, int]] | MostSimilar,
-    most: int | None,
-    longest_px: int,
-    keep: KeptPieces | None,
-    progress: Progress,
-) -> MatchedPhotographs:
-    pycolmap, count = import_pycolmap(), most or usual_count(len(paths))
-
-    def find(path: Path) -> tuple[str, SiftFeatures]:
-        name = name_of("features", *METHOD, cv2.__version__, count, longest_px, sensor, path.read_bytes())
-        kept = keep.read(name) if keep else None
-        features = SiftFeatures(**kept) if kept else sift_features(path, sensor, count, longest_px)
-        if keep and kept is None:
-            keep.write(name, **features._asdict())
-        return name, features
-
-    names, features = [], []
+    pycolmap, paths, most = import_pycolmap(), [p.path for p in photographs], count or usual_count(len(photographs))
+    features: list[SiftFeatures] = []
     with freed_memory_kept(), ThreadPoolExecutor(os.cpu_count()) as workers:
-        for k, (name, of_photograph) in enumerate(workers.map(find, paths)):
-            names.append(name)
-            features.append(of_photograph)
-            progress("features", k + 1, len(paths))
+        for found in workers.map(lambda path: sift_features(path, sensor, most, longest_px), paths):
+            features.append(found)
+            progress("features", len(features), len(paths))
     if isinstance(pairs, MostSimilar):
         largest = [largest_of(of_photograph) for of_photograph in features]
         pairs = most_similar(
@@ -184,36 +236,29 @@ def _matched(
     compared = sorted({(min(pair), max(pair)) for pair in pairs if pair[0] != pair[1]})
     ideal_px = [sensor.px_from_mm(ideal_coordinates(interior, f.xy_mm)) for f in features]
     off_line_px = _OFF_LINE * float(np.hypot(sensor.width_px, sensor.height_px))
-    results = []
-    with contextlib.ExitStack() as opened:
-        database: Path | None = None
+    counts, matched, off_line = [np.zeros((0, 2), int)], list[np.ndarray](), [np.zeros(0)]
+    with tempfile.TemporaryDirectory() as folder:
+        database = _database(pycolmap, Path(folder), sensor, features, ideal_px)
         for begin in range(0, len(compared), _CHUNK):
             chunk = compared[begin : begin + _CHUNK]
-            each = [(names[k], ideal_px[k].tobytes()) for pair in chunk for k in pair]
-            name = name_of("matches", *METHOD, pycolmap.__version__, _MIN_RATIO, off_line_px, *itertools.chain(*each))
-            kept = keep.read(name) if keep else None
-            if kept is None:
-                if database is None:
-                    folder = Path(opened.enter_context(tempfile.TemporaryDirectory()))
-                    database = _database(pycolmap, folder, sensor, features, ideal_px)
-                kept = _match_pairs(pycolmap, database, chunk, features, ideal_px, sensor, off_line_px)._asdict()
-                if keep:
-                    keep.write(name, **kept)
-            results.append(_PairResult(**kept))
+            of_chunk = _match_pairs(pycolmap, database, chunk, features, ideal_px, sensor, off_line_px)
+            counts.append(of_chunk[0])
+            matched += of_chunk[1]
+            off_line += of_chunk[2]
             progress("matches", begin + len(chunk), len(compared))
-    numbers = np.concatenate([np.zeros((0, 2), int), *(r.counts for r in results)])
-    verified = np.concatenate([np.zeros((0, 2), int), *(r.verified for r in results)])
-    off_line = np.concatenate([np.zeros(0), *(r.off_line for r in results)])
-    by_pair = np.split(verified, np.cumsum(numbers[:, 1]))[:-1]
-    factor = float(np.quantile(np.abs(off_line), _QUANTILE)) / _QUANTILE_SIGMA if len(off_line) else 1.0
-    return MatchedPhotographs(
+    scatter = np.abs(np.concatenate(off_line))
+    factor = float(np.quantile(scatter, _QUANTILE)) / _QUANTILE_SIGMA if len(scatter) else 1.0
+    result = MatchedPhotographs(
         [f.xy_mm for f in features],
         [factor * f.sigma_mm for f in features],
         factor,
-        [PairMatches(*pair, matches) for pair, matches in zip(compared, by_pair, strict=True) if len(matches)],
-        np.column_stack([np.array(compared, int).reshape(-1, 2), numbers]),
+        [PairMatches(*pair, matches) for pair, matches in zip(compared, matched, strict=True) if len(matches)],
+        np.column_stack([np.array(compared, int).reshape(-1, 2), np.concatenate(counts)]),
         {},
     )
+    blank = [len(xy) == 0 for xy in result.xy_mm]
+    alone = _alone([path.name for path in paths], blank, result.pairs, in_parts)
+    return result._replace(left_out={photographs[k].name: _BLANK if blank[k] else _ALONE for k in alone})
 
 
 def _database(pycolmap: Any, folder: Path, sensor: Sensor, features: list[SiftFeatures], ideal_px: list) -> Path:
@@ -230,7 +275,8 @@ def _database(pycolmap: Any, folder: Path, sensor: Sensor, features: list[SiftFe
 
 def _match_pairs(
     pycolmap: Any, database: Path, pairs: list[tuple[int, int]], features, ideal_px, sensor: Sensor, off_line_px: float
-) -> _PairResult:
+) -> tuple[np.ndarray, list[np.ndarray], list[np.ndarray]]:
+    """Match pairs; return counts of descriptor and verified matches, verified matches, and `_over_sigma` of these."""
     (database.parent / "pairs.txt").write_text("".join(f"{a} {b}\n" for a, b in pairs))
     pairing = pycolmap.ImportedPairingOptions()
     pairing.match_list_path = str(database.parent / "pairs.txt")
@@ -241,7 +287,7 @@ def _match_pairs(
     pycolmap.match_image_pairs(
         database, pairing_options=pairing, verification_options=verification, device=pycolmap.Device.cpu
     )
-    counts, verified, off_line = [], [np.zeros((0, 2), int)], [np.zeros(0)]
+    counts, verified, off_line = [], [], []
     with pycolmap.Database.open(database) as stored:
         for a, b in pairs:
             geometry = stored.read_two_view_geometry(a + 1, b + 1).inlier_matches
@@ -256,7 +302,7 @@ def _match_pairs(
                 one, other = ideal_px[a][rows[:, 0]], ideal_px[b][rows[:, 1]]
                 sigmas = (features[k].sigma_mm[r] / sensor.pixel_mm for k, r in zip((a, b), rows.T, strict=True))
                 off_line.append(_over_sigma(off_line_px, one, other, *sigmas))
-    return _PairResult(np.array(counts, int).reshape(-1, 2), np.concatenate(verified), np.concatenate(off_line))
+    return np.array(counts, int).reshape(-1, 2), verified, off_line
 
 
 def _places(matches: Int[np.ndarray, "n 2"], one: np.ndarray, other: np.ndarray) -> Int[np.ndarray, "places 2"]:

@@ -1,12 +1,13 @@
 """Camera calibration from photographs of a board with known targets."""
 
-from jaxphoto.procedures.calibration.start import distortion_model, free_parameters
-from jaxphoto.procedures.calibration.target_block import (
+from jaxphoto.procedures.calibration.start import (
     CAMERA,
     Board,
     Detection,
     TargetRows,
     calibration_block,
+    distortion_model,
+    free_parameters,
     reprojection_residuals,
     rms_px,
 )

@@ -46,16 +46,19 @@ from jaxphoto.errors import InputError
 from jaxphoto.initial.rays import padded_length
 from jaxphoto.linear_algebra import cholesky, inverse, solve
 from jaxphoto.procedures.adjust import adjust
-from jaxphoto.procedures.calibration.start import distortion_model, free_parameters, nearest_distortion, rough_interior
-from jaxphoto.procedures.calibration.target_block import (
+from jaxphoto.procedures.calibration.start import (
     CAMERA,
     Board,
     Detection,
     TargetRows,
     calibration_block,
+    distortion_model,
+    free_parameters,
+    nearest_distortion,
     reprojection_residuals,
     resected,
     rms_px,
+    rough_interior,
 )
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import covariance

@@ -2,7 +2,6 @@
 
 from jaxphoto.procedures.control.control_block import ControlledBlock, at_optimum, control_block, retest
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
-from jaxphoto.procedures.control.targets import control_block_with_targets
 
 __all__ = [
     "ControlledBlock",
@@ -11,6 +10,5 @@ __all__ = [
     "SurveyedPoints",
     "at_optimum",
     "control_block",
-    "control_block_with_targets",
     "retest",
 ]

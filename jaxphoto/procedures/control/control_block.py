@@ -9,34 +9,223 @@ rejected, and rejected points that agree are reinstated. Check points are never 
 
 Normalised residuals test observations (Baarda). Check points and rejected points are tested by their difference divided
 by its standard deviation, which includes survey and adjustment.
+
+Every three points (or 300 samples of three) determine a similarity. The one with the most consistent points is refined
+by least squares of these. The tolerance allows for deformations that the adjustment removes: distortion, or weakly
+determined positions. The first adjustment, which tests all points, starts without inconsistent ones.
 """
 
 import dataclasses
-from collections.abc import Callable, Collection
+from collections.abc import Callable, Collection, Iterator
+from itertools import combinations
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float
 
 from jaxphoto.adjustment import Adjustment
-from jaxphoto.block import Block, Start
+from jaxphoto.block import Block, Frame, Start
 from jaxphoto.errors import DatumError, InputError, counted, few
+from jaxphoto.georeferencing.map_frame import MapFrame, check_heights
 from jaxphoto.procedures.adjust import adjust_for_tables
-from jaxphoto.procedures.control.frame import MIN_POINTS, InFrame, in_frame, on_a_line, onto_control
 from jaxphoto.procedures.control.marks import Marked, intersected, into_block, marked, with_gnss_bias, without_names
-from jaxphoto.procedures.control.surveyed import MARK_SIGMA_PX, SIGMA_M, GivenControl, SurveyedPoints
+from jaxphoto.procedures.control.surveyed import (
+    MARK_SIGMA_PX,
+    SIGMA_M,
+    ControlSystem,
+    GivenControl,
+    SurveyedPoints,
+    check_near,
+    filled,
+    places,
+    system_of,
+)
+from jaxphoto.procedures.georeference_photographs import utm_of
+from jaxphoto.procedures.orientation.blocks import Similarity, similarity_between
 from jaxphoto.statistics import LEAST_CHECKED, covariance, normalised_residuals, redundancy_numbers
+
+_SAMPLES = 300
+# Tolerance of a point: number of standard deviations plus fraction of the extent of the control.
+_BEYOND, _BENT = 5.0, 0.01
+MIN_POINTS = 3
+
+
+class OntoControl(NamedTuple):
+    """Similarity, and the points that agree with it."""
+
+    similarity: Similarity
+    agree: Bool[np.ndarray, "points"]
+
+
+def onto_control(
+    there: Float[np.ndarray, "points 3"],
+    here: Float[np.ndarray, "points 3"],
+    sigma_m: Float[np.ndarray, "points"],
+    file: str,
+) -> OntoControl:
+    """Estimate the similarity from `there`, in the frame of a block, to surveyed points `here`.
+
+    `sigma_m`: standard deviations of the differences.
+
+    Raises InputError for fewer than three points, for collinear points, and if no four points are consistent, with the
+    cure if exchanging coordinates would help.
+    """
+    if len(here) < MIN_POINTS:
+        raise InputError(
+            f"{file}: {counted(len(here), 'control point')} in two photographs or more, but position, scale and "
+            "attitude of a block need three; mark more"
+        )
+    best = _best(there, here, sigma_m)
+    if best is None:
+        raise InputError(
+            f"{file}: the control points lie on a line, so the rotation about it is undetermined; mark one off the "
+            "line, or orient photographs with positions"
+        )
+    if len(here) > MIN_POINTS and best.agree.sum() > MIN_POINTS:
+        return best
+    if best.agree.all() and len(here) == MIN_POINTS:
+        return best
+    exchanged = _best(there, here[:, [1, 0, 2]], sigma_m)
+    if exchanged is not None and exchanged.agree.sum() > max(MIN_POINTS, best.agree.sum()):
+        raise InputError(
+            f"{file}: the control points fit the photographs with X and Y exchanged; exchange the two columns"
+        )
+    off = _off(best.similarity, there, here)
+    raise InputError(
+        f"{file}: the marks of the control points do not fit their coordinates ({np.median(off):.3g} m off in the "
+        "median); check names, system and order of coordinates, and give standard deviations of a less accurate survey"
+    )
+
+
+def on_a_line(there: Float[np.ndarray, "points 3"], here: Float[np.ndarray, "points 3"]) -> bool:
+    """Return True if all points are collinear, which leaves the rotation about their line undetermined."""
+    return next(_of_threes(there, here), None) is None
+
+
+def _off(similarity: Similarity, there, here) -> Float[np.ndarray, "points"]:
+    return np.linalg.norm(here - similarity.of(there), axis=1)
+
+
+def _size(here) -> float:
+    return float(np.linalg.norm(np.ptp(here, axis=0)))
+
+
+def _tolerance(here, sigma_m) -> Float[np.ndarray, "points"]:
+    return _BEYOND * sigma_m + _BENT * _size(here)
+
+
+def _of_threes(there, here) -> Iterator[Similarity]:
+    samples = list(combinations(range(len(here)), MIN_POINTS))
+    if len(samples) > _SAMPLES:
+        rng = np.random.default_rng(0)
+        samples = [tuple(rng.choice(len(here), MIN_POINTS, replace=False)) for _ in range(_SAMPLES)]
+    for pick in samples:
+        similarity = similarity_between(there[list(pick)], here[list(pick)], 0.02)
+        if similarity is not None:
+            yield similarity
+
+
+def _best(there, here, sigma_m) -> OntoControl | None:
+    tolerance = _tolerance(here, sigma_m)
+    best: tuple[float, Similarity] | None = None
+    for similarity in _of_threes(there, here):
+        off = _off(similarity, there, here) / tolerance
+        score = float(np.sum(off < 1) - np.minimum(off, 1).mean())
+        if best is None or score > best[0]:
+            best = score, similarity
+    if best is None:
+        return None
+    similarity = best[1]
+    for _ in range(5):
+        agree = _off(similarity, there, here) < tolerance
+        refined = similarity_between(there[agree], here[agree])
+        if refined is None:
+            break
+        similarity = refined
+    return OntoControl(similarity, _off(similarity, there, here) < tolerance)
+
+
+class InFrame(NamedTuple):
+    """Surveyed points in a Cartesian frame."""
+
+    frame: Frame
+    xyz: Float[np.ndarray, "points 3"]
+    """Coordinates in m; unknown heights are replaced by the median of the others."""
+    at_place: bool
+    """True if the block is already in this frame."""
+
+
+def in_frame(
+    block: Block, points: SurveyedPoints, words: str | None, code: int | None, vertical: int | None = None
+) -> InFrame:
+    """Transform the points to the frame of `block`, or to a new frame.
+
+    `words` is the coordinate system if the file does not specify one. `code` is the EPSG code of a new frame, by
+    default the system of the points or UTM; `vertical` is the EPSG code of its heights, by default as in the points.
+    Raises InputError for a missing, contradictory or unusable system, and for points far from the block.
+    """
+    system = stated_system(points, words)
+    if block.frame.kind == "epsg":
+        assert block.frame.code is not None and block.frame.origin is not None
+        if code is not None and code != block.frame.code:
+            raise InputError(f"the block is in EPSG:{block.frame.code} already, and EPSG:{code} is given; omit it")
+        if system.crs is None:
+            raise InputError(
+                f"{points.file} is in a local system and the block in EPSG:{block.frame.code}: give the control there, "
+                "or orient the photographs without their positions"
+            )
+        check_near(points, system, *block.frame.origin[:2])
+        there = places(points, system, block.frame.code)
+        heights = block.frame.vertical if vertical is None else vertical
+        if heights is None and block.frame.code == system.code:
+            # The transformed block uses the vertical system of the points.
+            heights = system.vertical
+        return InFrame(
+            dataclasses.replace(block.frame, vertical=heights), block.frame.map.local_from_place(there), True
+        )
+    if system.crs is None:
+        return InFrame(dataclasses.replace(block.frame, kind="local"), filled(points), False)
+    code = new_code(points, system) if code is None else code
+    there = places(points, system, code)
+    middle = np.median(there, axis=0)
+    origin = (round(float(middle[0]), 4), round(float(middle[1]), 4), 0.0)
+    if vertical is None and code == system.code:
+        vertical = system.vertical
+    if vertical is not None:
+        check_heights(code, vertical)
+    return InFrame(
+        Frame("epsg", code, vertical, origin=origin), MapFrame(code, vertical, origin).local_from_place(there), False
+    )
+
+
+def stated_system(points: SurveyedPoints, words: str | None) -> ControlSystem:
+    """Return the system in the file of `points`, else `words`. Raises InputError for none, and if they differ."""
+    stated = system_of(points.system, points.file) if points.system else None
+    given = system_of(words, "the EPSG code of the control") if words else None
+    if stated and given and stated.crs != given.crs:
+        raise InputError(f"{points.file} states {stated.name}, but {given.name} is given; omit the wrong one")
+    system = stated or given
+    if system is None:
+        raise InputError(
+            f"{points.file} does not state the coordinate system of its points; give its EPSG code (or local, for "
+            "Cartesian metres without a map)"
+        )
+    return system
+
+
+def new_code(points: SurveyedPoints, system: ControlSystem) -> int:
+    """Return the EPSG code for a block without one: the map system of the points, or the UTM zone."""
+    if system.code is not None and system.crs is not None and system.crs.is_projected:
+        return system.code
+    longitude, latitude, _ = np.median(places(points, system, 4326), axis=0)
+    return utm_of(longitude, latitude)
+
 
 CRITICAL = 4.0
 """Maximum normalised residual: one valid observation of 16,000 exceeds it."""
 
 # Minimum number of residuals for a scatter estimate; median of the larger of two standard normal errors.
 _ENOUGH, _LARGER = 8, 1.05
-# Minimum number of surveyed points for a scatter estimate; median of |N(0, 1)|; ratio of scatters above which a default
-# is rejected (the median of twelve exceeds 1.9 in one valid block of a hundred).
-_POINTS, _MEDIAN, _MORE = 6, 0.6745, 2.0
-# Maximum change of log(sigma) that does not require another adjustment.
-_STILL = 0.15
 
 
 class TestedControl(NamedTuple):
@@ -97,35 +286,6 @@ def scatter(marks_w: Float[np.ndarray, "rows"]) -> float:
     """
     finite = marks_w[np.isfinite(marks_w)]
     return max(1.0, float(np.median(finite)) / _LARGER) if len(finite) >= _ENOUGH else 1.0
-
-
-def poorer_survey(
-    w: Float[np.ndarray, "points 3"],
-    sigma_m: Float[np.ndarray, "points 3"],
-    assumed: Bool[np.ndarray, "points 3"],
-    guess_m: tuple[float, float, float],
-) -> Float[np.ndarray, "3"] | None:
-    """Estimate sigmas (m) of the coordinates `assumed` that explain most of them; return None if `sigma_m` does.
-
-    They follow from the medians of the normalised residuals of plan and height, so up to half of the points may be
-    blunders. Control with too much weight deforms the block, so several adjustments are needed: after the default
-    `guess_m` is rejected, standard deviations may also decrease. In the first estimate heights are as inaccurate as the
-    plan.
-    """
-    now, given_up = np.array(guess_m), bool((sigma_m[assumed] > max(guess_m)).any())
-    factor = np.ones(3)
-    for axes in ([0, 1], [2]):
-        if assumed[:, axes].any():
-            now[axes] = np.median(sigma_m[:, axes][assumed[:, axes]])
-        tested = assumed[:, axes] & np.isfinite(w[:, axes])
-        if tested.any(axis=1).sum() >= _POINTS:
-            factor[axes] = np.median(w[:, axes][tested]) / _MEDIAN
-    if given_up:
-        return None if np.abs(np.log(factor)).max() < _STILL else np.maximum(factor * now, guess_m)
-    if factor.max() < _MORE:
-        return None
-    poorer = np.maximum(factor, 1) * now
-    return np.maximum(poorer, poorer[0])
 
 
 def beyond(w: Float[np.ndarray, "points 3"]) -> Bool[np.ndarray, "points"]:
@@ -191,11 +351,11 @@ def control_block(
     rows, messages = rows.take(met.good), [*messages, *met.sentences]
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
     try:
-        block, start, agree, sigma, seen_sigma = _placed(block, frame, met.points, met.covariance, sigma, points)
+        block, start, agree, placed_messages = _placed(block, frame, met.points, met.covariance, sigma, points)
     except InputError as error:
         # Rejected marks explain why too few points remain.
         raise InputError("; ".join([str(error), *_one_height(points), *met.sentences[:_SAID]])) from error
-    messages += seen_sigma
+    messages += placed_messages
     count = np.bincount(rows.point, minlength=len(ids))
     known = np.where(np.isnan(points.coordinates), np.nan, frame.xyz)
     # One ray of a known point is an observation; one ray of an unknown point is not.
@@ -222,15 +382,10 @@ def control_block(
             adjusted = adjust(controlled)
         except DatumError as error:
             # The default standard deviations may be the reason why control does not determine the datum.
-            raise DatumError("; ".join([str(error), *_assumed(control, sigma)])) from error
+            raise DatumError("; ".join([str(error), *_assumed(control)])) from error
         if not bool(adjusted.converged):
             messages.append("the adjustment with control did not converge; it is not tested")
         tested = _spread(test_control(adjusted, len(which), known[which], sigma[which]), seen)
-        poorer = poorer_survey(tested.w[used], sigma[used], np.isnan(points.sigma_m[used]), SIGMA_M)
-        if poorer is not None and number + 1 < _ROUNDS and bool(adjusted.converged):
-            # Estimate standard deviations before testing points: most may contradict the default.
-            sigma = np.where(np.isnan(points.sigma_m), poorer, sigma)
-            continue
         new, rejected, text = _tested(tested, now, used, seen & ~points.check, ids, block.images)
         key = (used.tobytes(), len(now.image))
         if number + 1 == _ROUNDS or not text or key in tried or not bool(adjusted.converged):
@@ -244,8 +399,10 @@ def control_block(
         base = _from(base, adjusted)
         start[which] = np.asarray(adjusted.unknowns.points)[len(base.points) :]
     left = seen & ~points.check & ~used
-    messages = [*_assumed(control, sigma), *messages]
-    messages += _left_out(ids, left, tested, frame)
+    messages = [*_assumed(control), *messages]
+    for k in np.flatnonzero(left):
+        offset = ", ".join(f"{v:.3g}" for v in tested.off_m[k])
+        messages.append(f"control point {ids[k]} contradicts the rest by {offset} m (east, north, up) and is rejected")
     state = np.where(points.check, "check", np.where(used, "control", "left out"))
     state = np.where(seen, state, "not marked")
     if not_marked := [ids[k] for k in np.flatnonzero(~seen)]:
@@ -260,7 +417,7 @@ def control_block(
 def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: SurveyedPoints):
     """Transform the block to the frame of control.
 
-    Return block, initial points, consistent points, standard deviations of the survey, and messages.
+    Return block, initial points, consistent points, and messages.
     """
     whole = np.isfinite(points.coordinates).all(axis=1)
     known = np.flatnonzero(np.isfinite(met).all(axis=1) & ~points.check & whole)
@@ -271,16 +428,14 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
         how = " lie on a line, so the rotation about it is undetermined" if line else ""
         stays = f"the block stays {'at its positions' if by_positions else 'where it lies'}"
         messages = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
-        return block, met, agree, sigma, messages
+        return block, met, agree, messages
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
-    assumed, surveyed = np.isnan(points.sigma_m[known]).any(axis=1), np.linalg.norm(sigma[known], axis=1)
+    surveyed = np.linalg.norm(sigma[known], axis=1)
     if not frame.at_place:
         # `spread` is in the unit of the block: convert it by the scale of a first similarity.
-        first = onto_control(met[known], frame.xyz[known], surveyed, points.file, assumed)
+        first = onto_control(met[known], frame.xyz[known], surveyed, points.file)
         spread = spread * first.similarity.scale
-    onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file, assumed)
-    if onto.scatter_m is not None:
-        sigma = np.where(np.isnan(points.sigma_m), onto.scatter_m, sigma)
+    onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file)
     agree[known] = onto.agree
     messages = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} bring the block to their frame"]
     if frame.at_place:
@@ -289,18 +444,15 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
         there = "the positions of the photographs have" if by_positions else "the block has"
         messages.append(f"control lies {offset} m (east, north, up) from where {there} it")
     block = dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame)
-    return block, onto.similarity.of(met), agree, sigma, messages
+    return block, onto.similarity.of(met), agree, messages
 
 
-def _assumed(control: GivenControl, sigma: Float[np.ndarray, "points 3"]) -> list[str]:
-    messages, none = [], np.isnan(control.points.sigma_m)
-    if n := int(none.any(axis=1).sum()):
-        taken = np.where(none, sigma, 0.0).max(axis=0)
-        why = "they scatter about the photographs: " if (taken > SIGMA_M).any() else ""
-        east, north, up = np.where(none.any(axis=0), np.maximum(taken, SIGMA_M), SIGMA_M)
+def _assumed(control: GivenControl) -> list[str]:
+    messages = []
+    if n := int(np.isnan(control.points.sigma_m).any(axis=1).sum()):
         messages.append(
-            f"{n} surveyed points have no standard deviations: {why}{max(east, north):.2g} m east and north, {up:.2g} "
-            "m up are assumed"
+            f"{n} surveyed points have no standard deviations: {max(SIGMA_M[:2]):.2g} m east and north, "
+            f"{SIGMA_M[2]:.2g} m up are assumed"
         )
     messages += _one_height(control.points)
     if n := int(np.isnan(control.marks.sigma_px).sum()):
@@ -343,17 +495,6 @@ def _tested(tested: TestedControl, now: Marked, used, able, ids, images):
             f"the mark of {ids[p]} in {image} is {off:.3g} px off (w = {tested.marks_w[row]:.3g}) and rejected"
         )
     return new, rejected, messages
-
-
-def _left_out(ids, left, tested: TestedControl, frame: InFrame):
-    for k in np.flatnonzero(left):
-        offset = ", ".join(f"{v:.3g}" for v in tested.off_m[k])
-        text = f"control point {ids[k]} contradicts the rest by {offset} m (east, north, up) and is rejected"
-        near = np.linalg.norm(frame.xyz - tested.adjusted_m[k], axis=1)
-        other = int(np.argmin(np.where(np.arange(len(ids)) == k, np.inf, near)))
-        if near[other] < 0.1 * np.linalg.norm(tested.off_m[k]):
-            text += f": its marks show {ids[other]}; check the names"
-        yield text
 
 
 def _spread(tested: TestedControl, seen) -> TestedControl:

@@ -12,9 +12,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 from pyproj import CRS, Transformer
-from pyproj.aoi import AreaOfInterest
-from pyproj.database import query_crs_info
-from pyproj.enums import PJType
 from pyproj.exceptions import CRSError, ProjError
 
 from jaxphoto.errors import InputError, quoted
@@ -87,14 +84,6 @@ class GivenControl(NamedTuple):
 LOCAL = "local"
 _CODES = re.compile(r"(?:EPSG::?)?\s*(\d{1,6})(?:\s*\+\s*(?:EPSG::?)?(\d{1,6}))?\s*(?:[<#].*)?", re.IGNORECASE)
 _UTM = re.compile(r"WGS\s?84\s+UTM\s+(\d{1,2})\s*([NS])", re.IGNORECASE)
-_WKT = re.compile(r"\s*(GEOGCS|PROJCS|COMPD_CS|GEOGCRS|GEODCRS|PROJCRS|COMPOUNDCRS|GEOCCS)\[")
-# PROJ parameters that read no files.
-_KEYS = {
-    "proj", "zone", "south", "ellps", "datum", "units", "no_defs", "type", "lat_0", "lon_0", "lat_1", "lat_2", "lat_ts",
-    "k", "k_0", "x_0", "y_0", "towgs84", "a", "b", "rf", "alpha", "gamma", "lonc", "lat_b", "pm", "vunits", "wktext",
-    "over",
-}  # fmt: skip
-_LONGEST = 20_000
 # Maximum distance (m) of control from a flight.
 NEAR_M = 20_000.0
 
@@ -131,10 +120,6 @@ def system_of(words: str, place: str) -> ControlSystem:
     wrong = InputError(
         f"{place}: {quoted(words)} is not a coordinate system; write EPSG:25832, EPSG:25832+7837 with heights, or local"
     )
-    keys = {part.lstrip("+").split("=")[0] for part in words.split()}
-    is_wkt = bool(_WKT.match(words)) and "EXTENSION" not in words and "GRID" not in words.upper()
-    if len(words) > _LONGEST or not (is_wkt or (words.startswith("+proj=") and keys <= _KEYS)):
-        raise wrong
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
@@ -194,7 +179,7 @@ def filled(points: SurveyedPoints) -> Float[np.ndarray, "points 3"]:
 
 
 def check_near(points: SurveyedPoints, system: ControlSystem, longitude: float, latitude: float) -> None:
-    """Raise InputError for points far from the photographs, with a system that would fit."""
+    """Raise InputError for points far from the photographs, with the cure if exchanging coordinates would help."""
     code = system.code or 4326
     try:
         off = distance_m(places(points, system, code), longitude, latitude)
@@ -204,44 +189,14 @@ def check_near(points: SurveyedPoints, system: ControlSystem, longitude: float, 
         far = f"{points.file}: its points lie {off / 1000:,.0f} km from where the photographs were taken"
     if off <= NEAR_M:
         return
-    would = fitting(points, system, longitude, latitude)
-    cure = f"they would fit {would}" if would else "correct the coordinates, or the system"
-    raise InputError(f"{far}, if their system is {system.name}: {cure}")
-
-
-def fitting(points: SurveyedPoints, system: ControlSystem | None, longitude: float, latitude: float) -> str:
-    """Describe the system in which the points are near the photographs; return "" if there is none."""
-    exchanged = points._replace(coordinates=points.coordinates[:, [1, 0, 2]])
-    if system is not None and system.crs is not None and _near(exchanged, system, longitude, latitude):
-        return f"with the first two coordinates exchanged, in {system.name}"
-    for read, order in ((points, ""), (exchanged, ", with the first two coordinates exchanged")):
-        for code in (4326, *_systems_at(longitude, latitude)):
-            other = ControlSystem(CRS.from_epsg(code), code, None)
-            if _near(read._replace(own_axes=False), other, longitude, latitude):
-                return f"{other.name}{order}"
-    return ""
-
-
-def _near(points: SurveyedPoints, system: ControlSystem, longitude: float, latitude: float) -> bool:
+    cure = "correct the coordinates, or the system"
     try:
-        return distance_m(places(points, system, system.code or 4326), longitude, latitude) < NEAR_M
+        exchanged = points._replace(coordinates=points.coordinates[:, [1, 0, 2]])
+        if distance_m(places(exchanged, system, code), longitude, latitude) < NEAR_M:
+            cure = "they would fit with the first two coordinates exchanged"
     except InputError:
-        return False
-
-
-def _systems_at(longitude: float, latitude: float) -> list[int]:
-    """Return projected systems in metres that cover a position: UTM first, then national systems."""
-    area = AreaOfInterest(longitude, latitude, longitude, latitude)
-    listed = query_crs_info("EPSG", [PJType.PROJECTED_CRS], area, contains=True)
-    codes = sorted(listed, key=lambda info: (not info.name.startswith("WGS 84 / UTM"), int(info.code)))
-    usable = []
-    for info in codes:
-        try:
-            map_system(int(info.code))
-        except InputError:
-            continue
-        usable.append(int(info.code))
-    return usable
+        pass
+    raise InputError(f"{far}, if their system is {system.name}: {cure}")
 
 
 def distance_m(places: Float[np.ndarray, "n 3"], longitude: float, latitude: float) -> float:

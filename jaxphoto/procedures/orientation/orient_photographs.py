@@ -1,36 +1,217 @@
 """Orient a block from matched features, for a calibration of the camera that took them.
 
 1. COLMAP orients the images and joins matches to points (`colmap`).
-2. The network is adjusted iteratively, all parameters of the camera observed; gross errors are rejected (`rejection`).
+2. The network is adjusted iteratively, all parameters of the camera observed; gross errors are rejected.
 3. Parameters of the camera that the images determine become free (`self_calibration`), and the iteration is repeated.
+
+A false match along an epipolar line gives a two-ray point at a wrong depth without residuals. Its neighbours in the
+image contradict it: over an image the inverse depth of a surface varies slowly; for a plane it is linear. A two-ray
+point is rejected if its inverse depth is far from the median of its neighbours in both images, relative to their robust
+spread and its standard deviation. At depth discontinuities neighbours spread widely, and nothing is rejected.
+
+During the iteration every parameter is observed at its initial value with a standard deviation of 3 % of the image
+radius in the corner of the format, the principal distance with 10 %: real lenses deviate by a few times these values.
+The parameters that the images determine follow from the covariance of the adjustment without these observations. The
+others, the weakest first, remain observed in the block.
+
+Residuals of neighbouring rays are correlated if lens, rolling shutter or features have unmodelled errors. Standard
+deviations of independent rays are then too small by the square root of the design effect (Kish),
+
+    d = sum over cells (sum over the rays of a cell v)^2 / sum over all rays v^2,
+
+which is 1 for independent residuals v, and the number of rays per cell for residuals that are equal within cells.
 """
 
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
+import equinox as eqx
+import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+import scipy
+from jaxtyping import Array, Bool, Float
 
-from jaxphoto.adjustment import Adjustment, PaddedSizes, solve
+from jaxphoto.adjustment import Adjustment, NormalEquations, PaddedSizes, common_sizes, solve
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.errors import BlockError
+from jaxphoto.compiling import call_compiled
+from jaxphoto.errors import BlockError, camera_words
 from jaxphoto.initial.matches import PairMatches
 from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.procedures.orientation.colmap import MappedCamera, Network, map_images
-from jaxphoto.procedures.orientation.rejection import beyond_limit, unsupported
-from jaxphoto.procedures.orientation.self_calibration import (
-    SelfCalibration,
-    determined,
-    freed,
-    self_calibration,
-)
 from jaxphoto.short_repr import pretty_repr
-from jaxphoto.unknowns import Unknowns, default_priors
+from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 from jaxphoto.variants import some_images, without_observations
+
+# Prior standard deviations: distortion parameters and principal point (image shift in the corner of the format divided
+# by its radius); c (divided by c); a free parameter (as the first).
+_LENS, _C, _FREE = 0.03, 0.1, 0.3
+# Maximum ratio of the standard deviation of a determined parameter to its prior one.
+_DETERMINED = 0.5
+# Number of cells along the longer side of an image.
+_CELLS = 8
+
+
+class SelfCalibration(NamedTuple):
+    """Parameters of one camera that are not fixed, in the order of the model."""
+
+    camera: str
+    names: tuple[str, ...]
+    unit: dict[str, float]
+    """Change of each parameter that shifts the corner of the format by its radius."""
+    start: dict[str, float]
+    sizes: PaddedSizes
+    """Padded sizes of the whole block, so parts of it run the same compiled program."""
+
+    def observation(self, name: str) -> Weighted:
+        """Return the prior information of a parameter: its initial value with a standard deviation."""
+        sigma = (_C if name == "c_mm" else _LENS) * self.unit[name]
+        return Weighted(np.asarray(self.start[name]), np.asarray(sigma))
+
+    def with_priors(self, block: Block, free: tuple[str, ...]) -> Block:
+        """Return `block` with parameters `free` weakly observed at current values, others at initial values."""
+        interior, priors = block.start.unknowns.interior[self.camera], block.priors.interior[self.camera]
+        for name in self.names:
+            prior = self.observation(name)
+            if name in free:
+                now = np.asarray(get_parameter(interior, name), float)
+                prior = Weighted(now, np.asarray(_FREE * self.unit[name]))
+            priors = set_parameter(priors, name, prior)
+        return _with_camera_priors(block, self.camera, priors)
+
+    def final_priors(self, block: Block, free: tuple[str, ...]) -> Block:
+        """Return `block` with the parameters `free` free, and the others observed at initial values."""
+        priors = freed(block.priors.interior[self.camera], free)
+        for name in self.names:
+            if name not in free:
+                priors = set_parameter(priors, name, self.observation(name))
+        return _with_camera_priors(block, self.camera, priors)
+
+
+class Determined(NamedTuple):
+    """Parameters of a camera that images determine."""
+
+    names: tuple[str, ...]
+    observed: list[str]
+    """Reasons why other parameters remain observed, one message each."""
+    correlation_factor: float
+    """Factor of their standard deviations due to the correlation of neighbouring residuals."""
+
+
+def self_calibration(block: Block, camera: str) -> SelfCalibration:
+    """Set up the parameters of `camera` that a free network of images estimates: all that are not fixed."""
+    priors, sensor = block.priors.interior[camera], block.sensors[camera]
+    interior = block.start.unknowns.interior[camera]
+    names = tuple(n for n in parameter_names(priors) if get_parameter(priors, n) != FIXED)
+    corner = np.array([sensor.width_mm, sensor.height_mm]) / 2
+    unit = {n: float(np.linalg.norm(corner)) / corner_shift(interior, n, corner) for n in names}
+    start = {n: float(np.asarray(get_parameter(interior, n))) for n in names}
+    calibration = SelfCalibration(camera, names, unit, start, PaddedSizes())
+    return calibration._replace(sizes=common_sizes([calibration.with_priors(block, names)]))
+
+
+def corner_shift(interior: InteriorOrientation, name: str, corner: np.ndarray) -> float:
+    """Return the image shift (mm) per unit of a parameter: in the corner of the format, or its maximum along the
+    radius.
+
+    The maximum is used because radial terms vanish in the corner if that is their balance radius.
+    """
+    if name == "c_mm":
+        return float(np.linalg.norm(corner) / np.asarray(interior.c))
+    if name in ("xp_mm", "yp_mm"):
+        return 1.0
+    value, step = float(np.asarray(get_parameter(interior, name))), 1e-12
+    at = jnp.asarray(corner) * jnp.linspace(0.25, 1.0, 4)[:, None]
+    both = [np.asarray(jax.vmap(set_parameter(interior, name, value + s).closed_form)(at)) for s in (step, -step)]
+    return float(np.linalg.norm(both[0] - both[1], axis=1).max()) / (2 * step)
+
+
+def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined:
+    """Select the parameters of `calibration` that images determine; in `adjusted` all of them are observed."""
+    factor = correlation_factor(adjusted.block, np.asarray(adjusted.residuals.image))
+    matrix, labels = shared_covariance(adjusted), adjusted.structure.labels
+    camera, names = calibration.camera, calibration.names
+    place = [labels.index(f"interior[{camera}].{name}") for name in names]
+    priors = [calibration.observation(name) for name in names]
+    sigma = np.array([float(prior.sigma) for prior in priors])
+    loose = np.array([_FREE * calibration.unit[name] for name in names])
+    # Normal equations of the image points alone.
+    images = np.linalg.inv(matrix[np.ix_(place, place)]) - np.diag(sigma**-2.0)
+    weak = undetermined(names, images / (float(adjusted.sigma0) * factor) ** 2, sigma, loose)
+    return Determined(
+        tuple(name for name in names if name not in weak),
+        [
+            f"{name} of {camera_words(camera)} is observed where it starts, {float(prior.value):.6g} +- "
+            f"{float(prior.sigma):.2g}: the images determine the corner of the format only to "
+            f"{weak[name] / calibration.unit[name]:.1%} of its radius"
+            for name, prior in zip(names, priors, strict=True)
+            if name in weak
+        ],
+        factor,
+    )
+
+
+def correlation_factor(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> float:
+    """Return the square root of the design effect of the `residuals` of image rows, both axes together; at least 1."""
+    rows, sensors = block.image_points, [block.sensors[camera] for camera in block.image_camera]
+    half = np.array([(s.width_mm, s.height_mm) for s in sensors])[rows.image] / 2
+    side = 2 * half.max(axis=1, keepdims=True) / _CELLS
+    place = np.clip((np.asarray(rows.xy) + half) // side, 0, _CELLS - 1).astype(int)
+    cell = (np.asarray(rows.image) * _CELLS + place[:, 0]) * _CELLS + place[:, 1]
+    sums = np.stack([np.bincount(cell, v) for v in residuals])
+    return float(np.sqrt(max(1.0, np.sum(sums**2) / np.sum(residuals**2))))
+
+
+def shared_covariance(adjusted: Adjustment) -> np.ndarray:
+    """Return the a priori covariance of the unknowns that images share, independent of the datum."""
+    equations, n = adjusted.equations, adjusted.structure.n_shared
+    scale = np.asarray(equations.scale.shared)
+    inverse = np.asarray(call_compiled(_inverse, equations))[-n:, -n:]
+    return inverse * np.outer(scale, scale)
+
+
+@eqx.filter_jit
+def _inverse(equations: NormalEquations) -> Float[Array, "reduced reduced"]:
+    # Avoid statistics.covariance: with all points its compilation takes several times longer.
+    return equations.inverse_of_reduced()
+
+
+def undetermined(
+    names: tuple[str, ...], normal: np.ndarray, observed: np.ndarray, loose: np.ndarray
+) -> dict[str, float]:
+    """Return the parameters that the images do not determine, and their standard deviations from the images.
+
+    `normal` contains the normal equations of the images. Undetermined parameters are added as observations with the
+    standard deviations `observed`, the weakest first. The others are observed with `loose`, to keep the equations
+    regular.
+    """
+    weak = np.zeros(len(names), bool)
+    sigmas: dict[str, float] = {}
+    while True:
+        weight = np.where(weak, observed, loose) ** -2.0
+        sigma = np.sqrt(np.diagonal(np.linalg.inv(normal + np.diag(weight))))
+        part = np.where(weak, 0.0, sigma / observed)
+        weakest = int(np.argmax(part))
+        if not part[weakest] > _DETERMINED:
+            return sigmas
+        weak[weakest], sigmas[names[weakest]] = True, float(sigma[weakest])
+
+
+def freed(priors: InteriorOrientation, names: tuple[str, ...]) -> InteriorOrientation:
+    """Return priors of a camera with the parameters `names` FREE and all others FIXED."""
+    for name in parameter_names(priors):
+        priors = set_parameter(priors, name, FREE if name in names else FIXED)
+    return priors
+
+
+def _with_camera_priors(block: Block, camera: str, priors: InteriorOrientation) -> Block:
+    interior = block.priors.interior | {camera: priors}
+    return dataclasses.replace(block, priors=dataclasses.replace(block.priors, interior=interior))
+
 
 CAMERA = "camera"
 """Name of the camera of photographs in the block."""
@@ -308,3 +489,63 @@ def photographs_block(
         start=Start(unknowns, np.ones(n, bool), np.ones(n_points, bool)),
         priors=dataclasses.replace(default_priors(unknowns), interior={CAMERA: priors}),
     )
+
+
+# Maximum residual in robust standard deviations; minimum of this limit in a priori standard deviations.
+_LIMIT, _MIN_LIMIT = 4.0, 1.0
+# Number of nearest points in the image; maximum deviation of a depth in their robust spreads.
+_NEIGHBOURS, _DEPTH_LIMIT = 12, 8.0
+# Ratio of the standard deviation of a normal distribution to its median absolute deviation; ratio of the standard
+# deviation per axis to the median length of 2-D errors (Rayleigh).
+_MAD, _RAYLEIGH = 1.4826, 1 / 1.1774
+
+
+def beyond_limit(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> tuple[Bool[np.ndarray, " rows"], float]:
+    """Mark image rows whose `residuals`, over their sigmas, exceed the limit, at most one per point; also return the
+    limit.
+
+    Residuals are divided by the square root of the redundancy of one of n rays, (2 n - 3) / (2 n).
+    """
+    point = np.asarray(block.image_points.point)
+    rays = np.bincount(point, minlength=len(block.points))[point]
+    length = np.hypot(*residuals) / np.sqrt(1 - 1.5 / rays)
+    limit = max(_MIN_LIMIT, _LIMIT * _RAYLEIGH * float(np.median(length)))
+    largest = np.zeros(len(block.points))
+    np.maximum.at(largest, point, length)
+    return (length > limit) & (length == largest[point]), limit
+
+
+def unsupported(block: Block) -> Bool[np.ndarray, " rows"]:
+    """Mark image rows of two-ray points whose depths contradict their neighbours in both images."""
+    rows, start = block.image_points, block.start.unknowns
+    image, point = np.asarray(rows.image), np.asarray(rows.point)
+    ray = np.asarray(start.points)[point] - np.asarray(start.exterior.position)[image]
+    inverse = -1 / np.einsum("ni,ni->n", np.asarray(start.exterior.camera_from_object)[image, 2], ray)
+    c = np.array([float(start.interior[camera].c) for camera in block.image_camera])[image]
+    sigma = inverse * _relative_depth_sigma(ray, point, np.sqrt(np.mean(np.asarray(rows.sigma) ** 2, axis=1)) / c)
+    two = np.bincount(point)[point] == 2
+    contradicted = np.zeros(len(point), bool)
+    for number in np.unique(image):
+        rows_of = np.flatnonzero(image == number)
+        xy, tested = np.asarray(rows.xy)[rows_of], two[rows_of]
+        if len(rows_of) > _NEIGHBOURS and tested.any():
+            contradicted[rows_of[tested]] = _far(xy, inverse[rows_of], sigma[rows_of], tested)
+    return (np.bincount(point[contradicted], minlength=len(block.points)) == 2)[point]
+
+
+def _far(xy, inverse, sigma, tested: Bool[np.ndarray, " n"]) -> Bool[np.ndarray, " tested"]:
+    """Mark the `tested` points of an image whose `inverse` depths contradict their neighbours."""
+    # The nearest point is the point itself.
+    around = inverse[scipy.spatial.cKDTree(xy).query(xy[tested], _NEIGHBOURS + 1)[1][:, 1:]]
+    median = np.median(around, axis=1)
+    spread = _MAD * np.median(np.abs(around - median[:, None]), axis=1)
+    return np.abs(inverse[tested] - median) > _DEPTH_LIMIT * np.hypot(spread, sigma[tested])
+
+
+def _relative_depth_sigma(ray, point, sigma_rad) -> Float[np.ndarray, " rows"]:
+    """Return the relative standard deviation of the depths of two-ray points: errors of both rays over their angle."""
+    direction = ray / np.linalg.norm(ray, axis=1, keepdims=True)
+    total = np.stack([np.bincount(point, v) for v in direction.T], axis=1)
+    # The sum of two unit vectors at an angle g has the length 2 cos(g / 2).
+    half = np.arccos(np.clip(np.linalg.norm(total, axis=1) / 2, 0, 1))[point]
+    return np.sqrt(2) * sigma_rad / np.sin(np.maximum(2 * half, 1e-9))

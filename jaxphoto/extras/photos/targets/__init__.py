@@ -1,12 +1,10 @@
 """Calibration board targets in photographs: detection by OpenCV, measurement by least squares."""
 
-from jaxphoto.extras.photos.targets.board_description import SYNTAX, read_board
-from jaxphoto.extras.photos.targets.chessboard import Chessboard
-from jaxphoto.extras.photos.targets.circles import CircleGrid, CircularTargets
-from jaxphoto.extras.photos.targets.markers import ArucoGrid, CharucoBoard
+from jaxphoto.extras.photos.targets.board_description import SYNTAX, CharucoBoard, Chessboard, read_board
+from jaxphoto.extras.photos.targets.circles import CircleGrid
 from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern, Targets, find_targets, rendered
 
 __all__ = [
-    "SYNTAX", "ArucoGrid", "CharucoBoard", "Chessboard", "CircleGrid", "CircularTargets", "FoundBoard", "Pattern",
+    "SYNTAX", "CharucoBoard", "Chessboard", "CircleGrid", "FoundBoard", "Pattern",
     "Targets", "find_targets", "read_board", "rendered",
 ]  # fmt: skip

@@ -1,20 +1,12 @@
-"""Circular targets: centres by least squares, asymmetric grids, and fields of targets identified by arrangement.
+"""Circular targets: centres by least squares, and asymmetric grids.
 
     grey = m + g . d + a (1 - erf(e / s)) / 2,   rho = |L' d|,   e = rho (rho - 1) / |L L' d|,   d = pixel - centre
 
 e is the first-order distance from the ellipse rho = 1. The ten unknowns (centre, three elements of L, ln s, a, m, g)
 are estimated by `patches`. The centre of the ellipse is not the image of the circle's centre: see `eccentricity` in
 `jaxphoto.procedures.calibration.target_calibration`.
-
-Targets with known coordinates on a plane are identified by arrangement and size. A circle of known size and its image
-define the affine map from board to image up to a rotation. The direction to one neighbour defines the rotation; the
-other neighbours test it. The best hypotheses are extended to homographies over all targets. The result is the best fit
-among the labellings with most targets. If a different labelling fits as well, the arrangement is symmetric and there is
-no result. The visible side of a field is unknown (floor, ceiling, wall), so both are tried. For a mirror-symmetric
-arrangement it is the side of positive Z; vertical planes with such an arrangement are ambiguous.
 """
 
-from pathlib import Path
 from typing import NamedTuple
 
 import cv2
@@ -23,12 +15,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float
 
-from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.targets.patches import Patches, TargetPlaces, fit_patches, fits
 from jaxphoto.extras.photos.targets.pattern import FoundBoard, Pattern
-from jaxphoto.io.text_tables import read_csv
 from jaxphoto.procedures.calibration import Board
 
 # Half width (px) of the ring about the edge; maximum number of pixels per target.
@@ -54,12 +44,11 @@ class Blobs(NamedTuple):
         return Blobs(self.column_row[chosen], self.shape[chosen], self.dark[chosen])
 
 
-def elliptic_blobs(picture: np.ndarray, half_axes: tuple[np.ndarray, float] | None = None) -> Blobs:
+def elliptic_blobs(picture: np.ndarray) -> Blobs:
     """Detect elliptic spots in an image by adaptive thresholds with several window sizes. Spots at the border are
     rejected.
 
-    Of several spots with the same centre the most elliptic one is retained. `half_axes`: expected half axes (px, larger
-    first) and a tolerance factor; spots of other sizes are ignored, so a bright disc on a dark disc can be detected.
+    Of several spots with the same centre the most elliptic one is retained.
     """
     smooth = cv2.GaussianBlur(picture, (3, 3), 0)
     height, width = picture.shape
@@ -68,7 +57,7 @@ def elliptic_blobs(picture: np.ndarray, half_axes: tuple[np.ndarray, float] | No
         window = max(15, (min(height, width) // part) | 1)
         for above in (7, -7):
             mask = cv2.adaptiveThreshold(smooth, 255, cv2.ADAPTIVE_THRESH_MEAN_C, cv2.THRESH_BINARY, window, above)
-            kept += [blob for blob in _components(mask) if half_axes is None or _of_size(blob[1], *half_axes)]
+            kept += _components(mask)
     kept.sort(key=lambda blob: blob[2])
     centres, shapes = np.zeros((len(kept), 2)), np.zeros((len(kept), 2, 2))
     n = 0
@@ -79,10 +68,6 @@ def elliptic_blobs(picture: np.ndarray, half_axes: tuple[np.ndarray, float] | No
             n += 1
     darks = [_is_dark(smooth, centre, shape) for centre, shape in zip(centres[:n], shapes[:n], strict=True)]
     return Blobs(centres[:n], shapes[:n], np.array(darks, bool))
-
-
-def _of_size(shape: np.ndarray, half_axes: np.ndarray, factor: float) -> bool:
-    return bool((np.abs(np.log(half_axes / (1 / np.sqrt(np.linalg.eigvalsh(shape))))) < np.log(factor)).all())
 
 
 def _is_dark(picture: np.ndarray, centre: np.ndarray, shape: np.ndarray) -> bool:
@@ -234,7 +219,10 @@ class CircleGrid(Pattern):
 
     def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
         """Return the reflectance of black circles on white."""
-        return disc_reflectance(self.board, xy_m)
+        black = np.zeros(len(xy_m), bool)
+        for centre in self.board.xyz_m[:, :2]:
+            black |= np.sum((xy_m - centre) ** 2, axis=1) < self.radius_m**2
+        return np.where(black, 0.0, 1.0)
 
     def _like_the_grid(self, blobs: Blobs) -> Blobs:
         """Select the largest connected set of spots whose distances, in radii, match diagonal neighbours of the grid.
@@ -285,168 +273,3 @@ def _drawing(places: Float[np.ndarray, "n 2"]) -> tuple[np.ndarray, float, Float
     for spot in np.rint(spots * parts).astype(int).tolist():
         cv2.circle(drawn, spot, _APART_PX // 4 * parts, 0, -1, shift=_SHIFT)
     return drawn, scale, corner
-
-
-def disc_reflectance(board: Board, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-    """Return the reflectance: 0 inside the circles of the board, 1 outside."""
-    black = np.zeros(len(xy_m), bool)
-    for centre, diameter in zip(board.xyz_m[:, :2], board.diameter_m, strict=True):
-        black |= np.sum((xy_m - centre) ** 2, axis=1) < (diameter / 2) ** 2
-    return np.where(black, 0.0, 1.0)
-
-
-_MIN_TARGETS = 6
-_NEIGHBOURS = 8
-# Maximum error relative to the distance of neighbours: in a hypothesis, and after a homography (lens distortion).
-_OFF, _NEAR = 0.25, 0.3
-_GUESSES = 40
-# A labelling is a rival if it has at least this fraction of the maximum number of targets, and at most this multiple of
-# the smallest misfit.
-_AS_GOOD, _AS_NEAR = 0.8, 2.0
-# Maximum Z component of the unit normal of a plane treated as vertical.
-_UPRIGHT = 0.1
-
-
-class CircularTargets(Pattern):
-    """Dark or bright circles on a plane, from a CSV file: point, X_mm, Y_mm, Z_mm, diameter_mm.
-
-    Raises InputError for an invalid file, for fewer than six targets, and if the targets are not coplanar.
-    """
-
-    def __init__(self, path: Path) -> None:
-        table = read_csv(path, ("point", "X_mm", "Y_mm", "Z_mm", "diameter_mm"))
-        xyz = np.stack([table.numbers(name) for name in ("X_mm", "Y_mm", "Z_mm")], axis=1) / 1000
-        diameter = table.sigmas("diameter_mm")
-        for line in np.flatnonzero(np.isnan(diameter)):
-            raise table.bad(line, "diameter_mm is empty; give the diameter of the target")
-        ids = tuple(table.ids("point").tolist())
-        if len(set(ids)) < len(ids):
-            raise InputError(f"{path.name}: duplicate point; give each target a unique id")
-        if len(ids) < _MIN_TARGETS:
-            raise InputError(f"{path.name}: {len(ids)} targets, fewer than {_MIN_TARGETS}; add targets")
-        self.board = Board(path.stem, ids, xyz, diameter / 1000)
-        plane = self.board.plane
-        if plane is None:
-            raise InputError(
-                f"{path.name}: the targets are not coplanar (to 1 % of their extent); give the targets of one plane"
-            )
-        middle, axes = plane
-        self._flat = (xyz - middle) @ axes[:, :2]
-        self._upright = bool(abs(axes[2, 2]) < _UPRIGHT)
-
-    def find(self, picture: np.ndarray) -> FoundBoard | None:
-        """Detect the visible targets; None if the arrangement is not found or ambiguous."""
-        blobs = elliptic_blobs(picture)
-        for dark in (True, False):
-            candidates = blobs.take(blobs.dark == dark)
-            pairs = identified(self._flat, self.board.diameter_m / 2, candidates, self._upright)
-            if pairs is not None:
-                return FoundBoard(pairs[:, 0], fit_discs(picture, candidates.take(pairs[:, 1])))
-        return None
-
-    def reflectance(self, xy_m: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "n"]:
-        """Return the reflectance of black circles on white, for a board in the plane Z = 0."""
-        return disc_reflectance(self.board, xy_m)
-
-
-class _Labelling(NamedTuple):
-    """Pairs (target, blob), RMS misfit (px) of their homography, and side of the plane, 1 or -1."""
-
-    pairs: Int[np.ndarray, "pairs 2"]
-    misfit: float
-    side: int
-
-    def agrees(self, other: "_Labelling") -> bool:
-        """Return True if at least half of these pairs are in `other`, and the sides are equal."""
-        label = dict(other.pairs[:, ::-1].tolist())
-        same = sum(label.get(blob) == target for target, blob in self.pairs.tolist())
-        return self.side == other.side and same >= 0.5 * len(self.pairs)
-
-
-def identified(
-    flat: Float[np.ndarray, "targets 2"], radius: Float[np.ndarray, "targets"], blobs: Blobs, upright: bool = False
-) -> Int[np.ndarray, "pairs 2"] | None:
-    """Identify targets in the plane of the field. Return pairs (target, blob), or None if ambiguous.
-
-    `flat` has Y up as seen from the front; the front of an `upright` field is unknown.
-    """
-    if len(blobs.column_row) < _MIN_TARGETS:
-        return None
-    labellings: list[_Labelling] = []
-    for side in (1, -1):
-        front = flat * (side, 1)
-        grown = (_grown(front, guess, blobs) for guess in _guesses(front * (1, -1), radius, blobs))
-        labellings += [_Labelling(*g, side) for g in grown if g is not None]
-    best = _best(labellings)
-    if best is None and not upright:
-        best = _best([one for one in labellings if one.side == 1])
-    return None if best is None else best.pairs
-
-
-def _best(labellings: list[_Labelling]) -> _Labelling | None:
-    """Return the labelling with the smallest misfit among those with most targets; None if a different one fits as
-    well.
-    """
-    most = max((len(one.pairs) for one in labellings), default=0)
-    able = [one for one in labellings if len(one.pairs) >= _AS_GOOD * most]
-    best = min(able, key=lambda one: one.misfit, default=None)
-    if best is None or any(one.misfit < _AS_NEAR * best.misfit and not one.agrees(best) for one in able):
-        return None
-    return best
-
-
-def _nearest(places: Float[np.ndarray, "n 2"]) -> Int[np.ndarray, "n k"]:
-    distance = np.linalg.norm(places[:, None] - places, axis=2)
-    return np.argsort(distance, axis=1)[:, 1 : _NEIGHBOURS + 1]
-
-
-def _guesses(down, radius, blobs) -> list[np.ndarray]:
-    """Return hypotheses, longest first: pairs (target, blob) of a target and its consistent neighbours."""
-    near_target, near_blob = _nearest(down), _nearest(blobs.column_row)
-    # Neighbours relative to a target, in radii, with ellipses transformed to circles: only a rotation is unknown.
-    w = (down[near_target] - down[:, None]) / radius[:, None, None]
-    lower = np.linalg.cholesky(blobs.shape)
-    u = np.einsum("bji,bkj->bki", lower, blobs.column_row[near_blob] - blobs.column_row[:, None])
-    wc, uc = w[..., 0] + 1j * w[..., 1], u[..., 0] + 1j * u[..., 1]
-    guesses: list[np.ndarray] = []
-    for b in range(len(uc)):
-        # Axes: target, neighbour of the target, neighbour of the blob.
-        turn = uc[b][None, None, :] / wc[:, :, None]
-        size = np.abs(turn)
-        turned = wc[:, None, None, :] * (turn / np.maximum(size, 1e-12))[..., None]
-        error = np.abs(turned[..., None] - uc[b])
-        nearest = error.argmin(axis=4)
-        agrees = (error.min(axis=4) < _OFF * np.abs(wc)[:, None, None, :]) & (np.abs(np.log(size)) < _OFF)[..., None]
-        score = agrees.sum(axis=3)
-        for t in np.flatnonzero(score.max(axis=(1, 2)) >= 4):
-            m, n = np.unravel_index(score[t].argmax(), score[t].shape)
-            ok = np.flatnonzero(agrees[t, m, n])
-            pairs = np.column_stack([near_target[t, ok], near_blob[b, nearest[t, m, n, ok]]])
-            guesses.append(np.vstack([np.array([[t, b]]), pairs]))
-    return sorted(guesses, key=len, reverse=True)[:_GUESSES]
-
-
-def _grown(flat, pairs, blobs) -> tuple[np.ndarray, float] | None:
-    """Extend a hypothesis by homographies to all targets. Return pairs and misfit; None if this fails."""
-    spacing = np.linalg.norm(flat[_nearest(flat)[:, 0]] - flat, axis=1)
-    for _ in range(4):
-        if len(np.unique(pairs[:, 1])) < len(pairs) or len(pairs) < 4:
-            return None
-        h, _ = cv2.findHomography(flat[pairs[:, 0]], blobs.column_row[pairs[:, 1]])
-        if h is None:
-            return None
-        beside = flat + np.stack([spacing, np.zeros_like(spacing)], axis=1)
-        places, other = (cv2.perspectiveTransform(p[None], h)[0] for p in (flat, beside))
-        distance = np.linalg.norm(places[:, None] - blobs.column_row, axis=2)
-        blob = distance.argmin(axis=1)
-        good = distance.min(axis=1) < _NEAR * np.linalg.norm(other - places, axis=1)
-        good &= distance.argmin(axis=0)[blob] == np.arange(len(flat))
-        pairs = np.column_stack([np.flatnonzero(good), blob[good]])
-    if len(pairs) < _MIN_TARGETS:
-        return None
-    # Homography of the final pairs.
-    h, _ = cv2.findHomography(flat[pairs[:, 0]], blobs.column_row[pairs[:, 1]])
-    if h is None:
-        return None
-    off = cv2.perspectiveTransform(flat[pairs[:, 0]][None], h)[0] - blobs.column_row[pairs[:, 1]]
-    return pairs, float(np.sqrt(np.mean(np.sum(off**2, axis=1))))

@@ -1,15 +1,14 @@
-"""Least-squares fits of models to many small image patches in parallel, and corners of squares.
+"""Least-squares fits of models to many small image patches in parallel, and corners of chessboards.
 
     grey(pixel) = model(parameters, pixel) + noise,   v'v -> min,   C = s0^2 (J'J)^-1,   s0^2 = v'v / (n - u)
 
 s0 is estimated from the residuals, so model errors (sharpening halos, compression, shadows) increase the standard
 deviations.
 
-A corner where four squares meet (chessboard) and the corner of a single square are modelled as two straight edges with
-a common blur s (in addition to the pixel aperture) and a brightness that changes linearly, with d = pixel - corner:
+A corner where four squares meet (chessboard) is modelled as two straight edges with a common blur s (in addition to the
+pixel aperture) and a brightness that changes linearly, with d = pixel - corner:
 
-    four squares   grey = m + g . d + a erf(e1 / s) erf(e2 / s)
-    one square     grey = m + g . d + a (1 + erf(e1 / s)) (1 + erf(e2 / s)) / 4,    ek = d . (cos tk, sin tk)
+    grey = m + g . d + a erf(e1 / s) erf(e2 / s),    ek = d . (cos tk, sin tk)
 
 The nine unknowns (corner, t1, t2, ln s, a, m, g) are estimated in a circular window.
 """
@@ -132,24 +131,10 @@ def fit_crossings(
     `edges`: unit directions along the two edges of each corner. `reach_px`: radius around each corner without other
     edges.
     """
-    return _fit(_crossings, np.multiply, picture, near, edges, reach_px)
-
-
-def fit_square_corners(
-    picture: np.ndarray,
-    near: Float[np.ndarray, "n 2"],
-    edges: Float[np.ndarray, "n 2 2"],
-    reach_px: Float[np.ndarray, "n"],
-) -> TargetPlaces:
-    """Measure corners of single squares. `edges`: unit directions along the sides; see `fit_crossings`."""
-    return _fit(_square_corners, lambda one, other: (1 + one) * (1 + other) / 4, picture, near, edges, reach_px)
-
-
-def _fit(program, shape, picture, near, edges, reach_px) -> TargetPlaces:
     radius = np.clip(reach_px, _SMALLEST_PX, _LARGEST_PX)
     for _ in range(2):  # repeated about the measured corner
         patches = windows(picture, near, radius)
-        fit = fit_patches(program, _start(shape, patches, edges), patches)
+        fit = fit_patches(_crossings, _start(patches, edges), patches)
         moved = fit.parameters[:, :2]
         stayed = fit.fitted & (np.linalg.norm(moved, axis=1) < _FAR)
         near = near + np.where(stayed[:, None], moved, 0.0)
@@ -159,16 +144,13 @@ def _fit(program, shape, picture, near, edges, reach_px) -> TargetPlaces:
     return TargetPlaces(near, sigma, good)
 
 
-def _start(shape, patches, edges):
+def _start(patches, edges):
     """Return initial parameters: corner at the centre, given edges, brightness by linear least squares."""
     pixels, grey, used = patches
     across = np.stack([-edges[..., 1], edges[..., 0]], axis=-1)
-    # Orient the normal of each edge towards the other edge: a single square is on the positive side of both.
-    side = np.sign(np.sum(across * edges[:, ::-1], axis=2))
-    across = across * np.where(side == 0, 1.0, side)[:, :, None]
     angle = np.arctan2(across[..., 1], across[..., 0])
     distance = np.einsum("npk,nek->nep", pixels, across)
-    contrast = shape(*np.tanh(distance.transpose(1, 0, 2) / _BLUR))
+    contrast = np.prod(np.tanh(distance / _BLUR), axis=1)
     columns = np.stack([contrast, np.ones_like(contrast), pixels[..., 0], pixels[..., 1]], axis=2) * used[:, :, None]
     normal = columns.transpose(0, 2, 1) @ columns + 1e-9 * np.eye(4)
     linear = np.linalg.solve(normal, columns.transpose(0, 2, 1) @ (grey * used)[:, :, None])[:, :, 0]
@@ -176,7 +158,7 @@ def _start(shape, patches, edges):
     return np.column_stack([np.zeros((n, 2)), angle, np.full(n, np.log(_BLUR)), linear])
 
 
-def _edges(parameters, pixel):
+def _crossing(parameters, pixel):
     x, y = pixel[0] - parameters[0], pixel[1] - parameters[1]
     # Pixel integration (variance 1/12 per axis) limits the sharpness of an edge.
     width = jnp.sqrt(2 / 12 + jnp.exp(2 * parameters[4]))
@@ -184,24 +166,9 @@ def _edges(parameters, pixel):
         jax.scipy.special.erf((x * jnp.cos(t) + y * jnp.sin(t)) / width) for t in (parameters[2], parameters[3])
     )
     contrast, mean, in_column, in_row = parameters[5:]
-    return first, second, contrast, mean + in_column * x + in_row * y
-
-
-def _crossing(parameters, pixel):
-    first, second, contrast, mean = _edges(parameters, pixel)
-    return mean + contrast * first * second
-
-
-def _square_corner(parameters, pixel):
-    first, second, contrast, mean = _edges(parameters, pixel)
-    return mean + contrast * (1 + first) * (1 + second) / 4
+    return mean + in_column * x + in_row * y + contrast * first * second
 
 
 @eqx.filter_jit
 def _crossings(start: Float[Array, "n 9"], pixels: Float[Array, "n m 2"], grey, used):
     return fits(_crossing, start, pixels, grey, used)
-
-
-@eqx.filter_jit
-def _square_corners(start: Float[Array, "n 9"], pixels: Float[Array, "n m 2"], grey, used):
-    return fits(_square_corner, start, pixels, grey, used)
