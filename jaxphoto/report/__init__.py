@@ -6,7 +6,7 @@ from jaxphoto.report.distortion import plot_distortion, plot_distortion_band
 from jaxphoto.report.draws import correlation_cube, covariance_array, draws_cube, plot_draws, plot_effects
 from jaxphoto.report.findings import Finding, Verdict
 from jaxphoto.report.flight_plots import plot_photograph_residuals, plot_position_offsets, plot_time_line
-from jaxphoto.report.formatting import TABLE_FORMATS, check_table_format, to_latex, to_markdown, write_table
+from jaxphoto.report.formatting import TABLE_FORMATS, check_table_format, readable, to_latex, to_markdown, write_table
 from jaxphoto.report.lidar import plot_above, plot_lidar_heights
 from jaxphoto.report.model_choice import plot_models
 from jaxphoto.report.plots import (
@@ -53,7 +53,7 @@ __all__ = [
     "plot_ray_offsets", "plot_rays", "plot_residuals", "plot_residuals_by_radius", "plot_scanner_correlation",
     "plot_sensitivity", "plot_sigma_map", "plot_station_residuals", "plot_strip_differences", "plot_sweep",
     "plot_time_line", "plot_trajectory_errors", "prepare_pictures", "print_adjustment", "print_boresight",
-    "print_components", "print_warning", "recovery_spread", "recovery_table", "report_page", "snooped_findings",
+    "print_components", "print_warning", "readable", "recovery_spread", "recovery_table", "report_page", "snooped_findings",
     "summary_of", "to_latex", "to_markdown", "verdict_of", "write_boresight", "write_results", "write_table",
     "write_tables",
 ]  # fmt: skip
