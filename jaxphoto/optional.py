@@ -5,7 +5,7 @@ from contextlib import contextmanager
 
 EXTRAS = {
     "laspy": "lidar", "lazrs": "lidar",
-    "rasterio": "photos", "cv2": "photos", "pycolmap": "photos",
+    "cv2": "photos", "pycolmap": "photos",
     "pyarrow": "parquet",
 }  # fmt: skip
 """Extra of jaxphoto that installs each optional module."""

@@ -1,24 +1,29 @@
-"""Outputs of the notebooks, kept small beside them: docs/site/outputs/NAME.json, pictures in docs/images/gallery.
+"""Run notebooks and keep their outputs in them, small.
 
-Notebooks lie in the repository without outputs, so that their changes can be read. What a run showed is kept by cell,
-with the code that it is of; a notebook whose code has changed since has no outputs, and says so.
+python docs/site/outputs.py [NAME ...]
+
+Runs the notebooks whose names begin with one of NAME, all if none is given (twenty minutes). A notebook records the code
+that its outputs are of; tests/docs/test_site.py fails if the code has changed since.
 """
 
 import base64
+import datetime
 import hashlib
 import io
-import json
+import sys
 from pathlib import Path
 
 import nbformat
+from nbclient import NotebookClient
 from PIL import Image
+
+import jaxphoto
 
 ROOT = Path(__file__).resolve().parents[2]
 NOTEBOOKS = sorted((ROOT / "notebooks").glob("*.ipynb"))
-OUTPUTS, PICTURES = ROOT / "docs" / "site" / "outputs", ROOT / "docs" / "images" / "gallery"
-# A picture is as wide as a page of the site, and some 15 kB.
-_WIDTH, _QUALITY = 900, 60
-# Of one output the first of these that it has.
+# Width of a figure on the site, and colours that drawings and grey-scale photographs need.
+_WIDTH, _COLOURS = 900, 64
+# The first of these that an output has is kept.
 _KINDS = ("text/html", "image/png", "text/markdown", "text/latex", "text/plain")
 
 
@@ -28,44 +33,42 @@ def code_of(notebook: nbformat.NotebookNode) -> str:
     return hashlib.sha256(code.encode()).hexdigest()
 
 
-def keep(path: Path, executed: nbformat.NotebookNode, made: str) -> None:
-    """Write what a run of the notebook showed, instead of what was kept; `made` says when and with what."""
-    for old in PICTURES.glob(f"{path.stem}_*.webp"):
-        old.unlink()
-    cells = [cell for cell in executed.cells if cell.get("outputs")]
-    shown = {cell.id: [_small(path.stem, cell.id, output) for output in cell.outputs] for cell in cells}
-    kept = {"made": made, "code": code_of(executed), "cells": shown}
-    OUTPUTS.mkdir(exist_ok=True)
-    (OUTPUTS / f"{path.stem}.json").write_text(json.dumps(kept, indent=1, ensure_ascii=False) + "\n", "utf-8")
+def is_current(notebook: nbformat.NotebookNode) -> bool:
+    """Return True if the outputs are of this code."""
+    return notebook.metadata.get("jaxphoto", {}).get("code") == code_of(notebook)
 
 
-def _small(stem: str, cell: str, output: nbformat.NotebookNode) -> dict:
-    """Return a stream unchanged, other outputs in their richest form, pictures as files."""
-    if output.output_type == "stream":
-        return {"output_type": "stream", "name": output.name, "text": output.text}
+def run(path: Path) -> None:
+    """Run a notebook and keep its outputs."""
+    notebook = nbformat.read(path, as_version=4)
+    place = {"metadata": {"path": path.parent}}
+    NotebookClient(notebook, timeout=1200, kernel_name="python3", resources=place).execute()
+    for cell in notebook.cells:
+        cell.metadata.pop("execution", None)
+        for output in cell.get("outputs", ()):
+            if output.output_type != "stream":
+                _reduce(output)
+    made = f"{datetime.date.today()}, jaxphoto {jaxphoto.__version__}"
+    notebook.metadata["jaxphoto"] = {"run": made, "code": code_of(notebook)}
+    notebook.metadata.pop("language_info", None)
+    nbformat.write(notebook, path)
+
+
+def _reduce(output: nbformat.NotebookNode) -> None:
+    """Keep the richest form of an output; reduce figures in size and colours."""
     kind = next(kind for kind in _KINDS if kind in output.data)
     value = output.data[kind]
     if kind == "image/png":
         picture = Image.open(io.BytesIO(base64.b64decode(value))).convert("RGB")
         picture.thumbnail((_WIDTH, 4 * _WIDTH))
-        number = len(list(PICTURES.glob(f"{stem}_{cell}*.webp")))
-        name = f"{stem}_{cell}{f'_{number}' if number else ''}.webp"
-        picture.save(PICTURES / name, quality=_QUALITY, method=6)
-        kind, value = "text/html", f'<img src="../images/gallery/{name}" alt="What the cell above draws">'
-    return {"output_type": "display_data", "metadata": {}, "data": {kind: value}}
+        file = io.BytesIO()
+        picture.quantize(_COLOURS, dither=Image.Dither.NONE).save(file, "PNG", optimize=True)
+        value = base64.b64encode(file.getvalue()).decode()
+    output.data = {kind: value}
 
 
-def kept(path: Path) -> dict | None:
-    """Return the stored outputs of this code."""
-    file = OUTPUTS / f"{path.stem}.json"
-    found = json.loads(file.read_text("utf-8")) if file.is_file() else None
-    return found if found and found["code"] == code_of(nbformat.read(path, as_version=4)) else None
-
-
-def with_outputs(path: Path) -> nbformat.NotebookNode:
-    """Return the notebook with its stored outputs."""
-    notebook, shown = nbformat.read(path, as_version=4), kept(path)
-    for cell in notebook.cells:
-        if shown and cell.cell_type == "code":
-            cell.outputs = [nbformat.from_dict(output) for output in shown["cells"].get(cell.id, ())]
-    return notebook
+if __name__ == "__main__":
+    for path in NOTEBOOKS:
+        if path.name.startswith(tuple(sys.argv[1:]) or ("",)):
+            print(path.name, flush=True)
+            run(path)

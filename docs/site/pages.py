@@ -21,7 +21,7 @@ from mkdocs.config.defaults import MkDocsConfig
 from mkdocs.plugins import event_priority
 from mkdocs.structure.files import File, Files
 from mkdocs.structure.pages import Page
-from outputs import NOTEBOOKS, ROOT, kept, with_outputs
+from outputs import NOTEBOOKS, ROOT, is_current
 
 _LOG = logging.getLogger("mkdocs.hooks.pages")
 # Where MkDocs finds the notebooks with their outputs while it builds.
@@ -61,11 +61,12 @@ def on_config(config: MkDocsConfig) -> MkDocsConfig:
 def on_files(files: Files, config: MkDocsConfig) -> Files:
     """Add the notebooks, which lie beside docs/, and the reference, which is written here."""
     for path in NOTEBOOKS:
-        if not kept(path):
-            _LOG.warning("%s has no outputs of its code: python docs/site/gallery.py %s", path.name, path.stem)
+        notebook = nbformat.read(path, as_version=4)
+        if not is_current(notebook):
+            _LOG.warning("%s has outputs of other code: python docs/site/outputs.py %s", path.name, path.stem)
         shown = _WITH_OUTPUTS / "notebooks" / path.name
         shown.parent.mkdir(parents=True, exist_ok=True)
-        nbformat.write(_as_on_site(with_outputs(path)), shown)
+        nbformat.write(_as_on_site(notebook), shown)
         files.append(File(f"notebooks/{path.name}", str(_WITH_OUTPUTS), config.site_dir, config.use_directory_urls))
     for room, names in _public().items():
         entries = "\n\n".join(f"::: {name}" for name in names)
@@ -83,8 +84,8 @@ def on_page_content(html: str, page: Page, config: MkDocsConfig, files: Files) -
     notebook = ROOT / "notebooks" / Path(page.file.src_uri).name
     if not page.file.src_uri.endswith(".ipynb"):
         return html
-    shown = kept(notebook)
-    words = f"<p><em>notebooks/{notebook.name}, run on {shown['made']}.</em></p>" if shown else ""
+    made = json.loads(notebook.read_text("utf-8"))["metadata"]["jaxphoto"]["run"]
+    words = f"<p><em>notebooks/{notebook.name}, run on {made}.</em></p>"
     heading, end, rest = html.partition("</h1>")
     return f"{heading}{end}{words}{rest}"
 

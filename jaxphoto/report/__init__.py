@@ -5,7 +5,7 @@ from jaxphoto.report.boresight import plot_boresight, print_boresight, write_bor
 from jaxphoto.report.draws import plot_draws, plot_effects
 from jaxphoto.report.findings import Finding, Verdict
 from jaxphoto.report.flight import plot_position_offsets
-from jaxphoto.report.formatting import TABLE_FORMATS, check_table_format, to_latex, to_markdown, write_table
+from jaxphoto.report.formatting import TABLE_FORMATS, check_table_format, readable, to_latex, to_markdown, write_table
 from jaxphoto.report.lidar import plot_above, plot_lidar_heights
 from jaxphoto.report.model_choice import plot_models
 from jaxphoto.report.plots import (
@@ -50,7 +50,7 @@ __all__ = [
     "plot_position_offsets", "plot_ray_offsets", "plot_residuals", "plot_residuals_by_radius",
     "plot_scanner_correlation", "plot_sensitivity", "plot_sigma_map", "plot_station_residuals",
     "plot_strip_differences", "plot_sweep", "plot_trajectory_errors", "prepare_pictures", "print_adjustment",
-    "print_boresight", "print_components", "print_warning", "recovery_spread", "recovery_table", "report_page",
+    "print_boresight", "print_components", "print_warning", "readable", "recovery_spread", "recovery_table", "report_page",
     "snooped_findings", "summary_of", "to_latex", "to_markdown", "verdict_of", "write_boresight", "write_results",
     "write_table", "write_tables",
 ]  # fmt: skip
