@@ -1,7 +1,7 @@
 """Block: observations as rows, with the images and points they refer to.
 
-Observations are rows (`jaxphoto.observations`). Vertical control is rows with axis 2: neither NaN nor infinite sigmas
-occur, and the redundancy is a count. Units are metres, radians and millimetres on the image.
+Observations are rows (`jaxphoto.observations`). Vertical control consists of rows with axis 2: neither NaN nor infinite
+sigmas occur, and the redundancy is a count. Units are metres, radians and millimetres on the image.
 """
 
 import dataclasses

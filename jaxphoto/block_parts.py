@@ -22,7 +22,7 @@ class Datum:
 
     `control`: the observations must determine them. `minimal`: the minimum number of point coordinates fixed at their
     start values. `inner`: inner constraints over all points, all images or the named points (`over`); `scale` None
-    means "constrain the scale if it is open".
+    means "constrain the scale if it is undetermined".
     """
 
     kind: Literal["control", "minimal", "inner"] = "control"

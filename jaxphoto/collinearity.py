@@ -170,7 +170,7 @@ def intersect(
     origins, directions = single("origins", origins, None, 3), single("directions", directions, len(origins), 3)
     w = jnp.ones(len(origins)) if weights is None else single("weights", weights, len(origins))
     across = w[:, None, None] * (jnp.eye(3) - directions[:, :, None] * directions[:, None, :])
-    # Relative to the first origin: large coordinates lose no digits.
+    # Use coordinates relative to the first origin: large coordinates would lose digits.
     b = jnp.einsum("nij,nj->i", across, origins - origins[0])
     return origins[0] + solve(jnp.sum(across, 0), b)
 

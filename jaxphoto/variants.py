@@ -131,7 +131,7 @@ def with_control(block: Block, points: Collection[str], sigma: float | Float[np.
 
 
 def vertical_control(block: Block) -> Block:
-    """Use control in height only: Z of control and check points is control, X and Y are check coordinates.
+    """Use vertical control only: Z of control and check points become control, X and Y check coordinates.
 
     A check coordinate without sigma gets the sigma of the control (`all_control`). Fixed heights remain fixed.
     """

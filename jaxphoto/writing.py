@@ -56,7 +56,7 @@ def whole_file(path: Path) -> Iterator[Path]:
     """
     target = _real(path)
     if os.path.lexists(target) and not target.is_file():
-        raise InputError(f"{path} exists and is not a regular file: name a file")
+        raise InputError(f"{path} exists and is not a regular file: use another path")
     with _work_place(target) as work:
         yield work
         _flush(work)
@@ -105,16 +105,16 @@ def check_folder(directory: Path, *inputs: Path) -> None:
     target = _real(directory)
     for given in inputs:
         if target in (real := _real(given), *real.parents):
-            raise InputError(f"{directory} is or contains the input {given}, which would be lost: name another folder")
+            raise InputError(f"{directory} is or contains the input {given}, which would be lost: use another folder")
     _check_parents(target, "name a folder")
     if os.path.ismount(target):
-        raise InputError(f"{directory} is a mount point, which cannot be replaced: name a folder in it")
+        raise InputError(f"{directory} is a mount point, which cannot be replaced: use a folder in it")
     if os.path.lexists(target) and not target.is_dir():
-        raise InputError(f"{target} is a file: name a folder")
+        raise InputError(f"{target} is a file: give a folder")
     check_room(target)
     if target.is_dir():
         if not os.access(target, os.W_OK):
-            raise InputError(f"{directory} is read-only: name another folder, or change its permissions")
+            raise InputError(f"{directory} is read-only: use another folder, or change its permissions")
         _written(target)
 
 
@@ -122,10 +122,10 @@ def check_file(path: Path, *inputs: Path) -> None:
     """Raise InputError if a new file `path` cannot be written, or exists."""
     target = _real(path)
     if target in map(_real, inputs):
-        raise InputError(f"{path} is the input itself, which would be lost: name another file")
+        raise InputError(f"{path} is the input itself, which would be lost: use another file")
     if os.path.lexists(target):
-        raise InputError(f"{path} exists already: name a new file")
-    _check_parents(target, "name a file in a folder")
+        raise InputError(f"{path} exists already: use a new file")
+    _check_parents(target, "give a file in a folder")
     check_room(target)
 
 
@@ -136,7 +136,7 @@ def check_room(target: Path) -> None:
         with _work_place(folder / "room") as work:
             work.joinpath(*target.relative_to(folder).parts).mkdir(parents=True)
     except OSError as error:
-        raise InputError(f"{target} cannot be written ({error.strerror}): name another place") from None
+        raise InputError(f"{target} cannot be written ({error.strerror}): use another path") from None
 
 
 def files_in(folder: Path) -> list[str]:
@@ -197,12 +197,12 @@ def _written(folder: Path) -> set[str]:
         return set()
     listed = _listed(folder)
     if listed is None:
-        raise InputError(f"{folder} is not empty and was not written by jaxphoto: name a new folder")
+        raise InputError(f"{folder} is not empty and was not written by jaxphoto: use a new folder")
     for name, digest in listed.items():
         path = folder / name
         if os.path.lexists(path) and (path.is_symlink() or not path.is_file() or _digest(path) != digest):
             raise InputError(
-                f"{path} was changed since jaxphoto wrote it, and would be lost: move it away, or name a new folder"
+                f"{path} was changed since jaxphoto wrote it, and would be lost: move it away, or use a new folder"
             )
     return set(listed)
 
@@ -220,7 +220,7 @@ def _keep_foreign(old: Path, new: Path, written: set[str]) -> None:
                 continue
             if os.path.lexists(to) or any(parent.is_file() for parent in to.parents):
                 raise InputError(
-                    f"{path} was not written by jaxphoto and would be lost: move it away, or name a new folder"
+                    f"{path} was not written by jaxphoto and would be lost: move it away, or use a new folder"
                 )
             to.parent.mkdir(parents=True, exist_ok=True)
             try:

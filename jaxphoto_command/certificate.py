@@ -75,7 +75,7 @@ def certificate_document(
 def read_two(
     paths: tuple[Path, Path], cameras: tuple[str | None, str | None], pixel_mm: float | None, block: Path | None
 ) -> tuple[CameraFile, CameraFile]:
-    """Read camera files A and B of one sensor. By default both cameras have the same name."""
+    """Read camera files A and B of one sensor. The default name of the camera in B is its name in A."""
     names = (cameras[0], cameras[1] if cameras[1] is not None else cameras[0])
     a, b = (
         read_camera_file(path, camera=name, pixel_mm=pixel_mm, block=block)

@@ -37,7 +37,7 @@ def test_a_block_is_adjusted_with_control(written, tmp_path, monkeypatch, capsys
     out = tmp_path / "out"
     given = (written / "block", written / "points.csv", "--marks", written / "marks.csv", "--control-epsg", CODE)
     _, said, _ = run(monkeypatch, capsys, "control", *given, "--out", out)
-    assert "6 of 6 control points bring the block to their frame" in said
+    assert "6 of 6 control points define the frame of the block" in said
     assert "3 check points: RMSE" in said
     points = pd.read_csv(out / "surveyed_points.csv")
     assert (points["state"] == ["control"] * len(CONTROL) + ["check"] * len(CHECK)).all()
@@ -62,7 +62,7 @@ def test_a_block_is_adjusted_with_control(written, tmp_path, monkeypatch, capsys
 def test_what_cannot_be_is_said(written, tmp_path, monkeypatch, capsys):
     for arguments, message in (
         ((written / "marks.csv",), "marks.csv has marks but no coordinates"),
-        ((written / "none.csv",), "there is no file"),
+        ((written / "none.csv",), "file not found"),
     ):
         given = (written / "block", *arguments, "--out", tmp_path / "o")
         code, _, wrong = run(monkeypatch, capsys, "control", *given)

@@ -59,8 +59,8 @@ def test_photographs_become_a_block(taken, tmp_path, monkeypatch, capsys):
         (["--model", "pinhole"], "pinhole"),
         (["--model", "brown", "--r0-mm", "3"], "R0 belongs to the model smac"),
         (["--r0-mm", "nan"], "R0 belongs to the model smac"),
-        (["--model", "smac", "--r0-mm", "-1"], "R0 = -1 mm does not lie on an image"),
-        (["--model", "smac", "--r0-mm", "nan"], "R0 = nan mm does not lie on an image"),
+        (["--model", "smac", "--r0-mm", "-1"], "R0 = -1 mm is outside the format"),
+        (["--model", "smac", "--r0-mm", "nan"], "R0 = nan mm is outside the format"),
         (["--pairs", "nearest"], "unknown choice of pairs 'nearest'"),
     ],
 )

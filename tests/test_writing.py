@@ -140,7 +140,7 @@ def test_what_can_be_no_folder_is_said_before_that_its_place_cannot_be_written(t
 
     monkeypatch.setattr("jaxphoto.writing.tempfile.mkdtemp", fails)
     (tmp_path / "file").write_text("1")
-    with pytest.raises(InputError, match="file is a file: name a folder"):
+    with pytest.raises(InputError, match="file is a file: give a folder"):
         check_folder(tmp_path / "file")
     with pytest.raises(InputError, match="cannot be written"):
         check_folder(tmp_path / "folder")

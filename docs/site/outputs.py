@@ -2,8 +2,8 @@
 
 python docs/site/outputs.py [NAME ...]
 
-Runs the notebooks whose names begin with one of NAME, all if none is given (twenty minutes). A notebook records the code
-that its outputs are of; tests/docs/test_site.py fails if the code has changed since.
+Runs the notebooks whose names begin with one of NAME, all if none is given (twenty minutes). A notebook records the
+code that its outputs are of; tests/docs/test_site.py fails if the code has changed since.
 """
 
 import base64

@@ -189,8 +189,8 @@ def build_problem(
     constraints = close_datum(block, values, structure)
     values = with_datum(values, constraints.eop, constraints.points)
     constrained, coupled = len(constraints.eop) > 0, bool(structure.coupled)
-    # Use one device: such rows may couple points of two devices, and the closed form of constraints in statistics is
-    # valid only for the open motions.
+    # Use one device: such rows may couple points of two devices, and the closed form of the constraints in statistics
+    # is valid only for undetermined motions.
     alone = alone or is_traced(values) or coupled or (constrained and not n_open_motions(values, structure))
     shards = 1 if alone else _devices_worth_using(len(structure.image))
     dense = constrained or coupled
@@ -216,7 +216,7 @@ def _layout_key(block: Block, priors: Unknowns, observed: ObservedRows) -> Hasha
 
 
 def _factored_like(values: PaddedValues, structure: PaddedStructure) -> FactoredNormal:
-    """Return abstract arrays of the right types, without memory."""
+    """Return abstract arrays of the right types, without allocating memory."""
     zero = zero_increments(structure)
     system = jax.eval_shape(zero_system, zero, values, structure)
     reduced, factor, scale = jax.tree.map(

@@ -136,7 +136,7 @@ def _all(y: Increments, varying: Varying, common: Common) -> Increments:
 
 
 def _others_alone(zero: Increments, varying: Varying, common: Common) -> Increments:
-    """Return the gradient at the nominal optimum for draws with nominal image rows, which contribute nothing there."""
+    """Return the gradient at the nominal optimum for draws with nominal image rows: the change of all other rows."""
     nominal = other_gradients(jax.tree.map(lambda v: v[..., :1], zero), {}, common)
     return jax.tree.map(jnp.subtract, other_gradients(zero, varying, common), nominal)
 

@@ -34,14 +34,15 @@ _VAGUE = 0.05
 def close_datum(block: Block, values: Values, structure: Structure) -> DatumRows:
     """Return the constraints that remove the datum defect (leading axis: the defect).
 
-    Raises DatumError if the datum is open and its kind is "control", or if the requested constraints cannot remove the
-    defect.
+    Raises DatumError if the datum is undetermined and its kind is "control", or if the requested constraints cannot
+    remove the defect.
     """
     judged = block.datum.kind == "control" and not is_traced((values, block))
     without_place = is_traced((values.points, values.position)) and is_traced(block.start.unknowns)
     values = _concrete(values, block)
     if judged:
-        # Use observed positions: approximate values scatter about a line of collinear control.
+        # Use observed positions: approximate values of collinear control scatter about its line, which hides the
+        # defect.
         values = _as_observed(block, values)
     if _plainly_closed(block, values, structure, _VAGUE if judged else np.inf):
         return DatumRows(np.zeros((0, 6, structure.n_images)), np.zeros((0, 3, structure.n_points)))
@@ -91,7 +92,7 @@ def _concrete(values: Values, block: Block) -> Values:
     """Replace traced values: the datum depends only weakly on positions.
 
     Unknown positions are drawn at random. Whether observations determine the datum depends, except for coincidences,
-    only on the unknowns that each observation touches.
+    only on the unknowns that each observation involves.
     """
     known = block.start.unknowns
     place = {"position": known.exterior.position, "points": known.points}
@@ -171,7 +172,7 @@ def _datum_sensitivity(
     weighted = {int(j) for g in s.observed if g.name.startswith(PRIORS) for j in g.column.ravel()}
     placed = {g.name for g in s.observed if len(g.image) or len(g.point)}
     if placed <= {ControlCoordinates.group}:
-        # With control only, there is nothing to differentiate: its rows are the motions of its points.
+        # With control only, no differentiation is needed: its rows are the motions of its points.
         control = block.control
         rows = motions.points[:, control.axis, control.who].T / _control_sigma(values, s)[:, None]
         sensitivity = SeenMotions.of_motions(rows)
@@ -201,7 +202,7 @@ def _combine(motions: DatumRows, combinations: np.ndarray) -> DatumRows:
 
 
 def _inner(null: DatumRows, block: Block, over) -> DatumRows:
-    """Return inner constraints: the open motions, restricted to the positions or points of the datum."""
+    """Return inner constraints: the undetermined motions, restricted to the positions or points of the datum."""
     if over == "images":
         eop = null.eop.copy()
         eop[:, 3:] = 0.0

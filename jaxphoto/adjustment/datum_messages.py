@@ -1,4 +1,4 @@
-"""Messages about an undetermined datum: open motions by name, available observations, and the cure."""
+"""Messages about an undetermined datum: undetermined motions by name, available observations, and the cure."""
 
 import numpy as np
 from jaxtyping import Float
@@ -30,8 +30,8 @@ def motion_names(combinations: Float[np.ndarray, "n motions"]) -> list[str]:
 
 
 def datum_sentence(null_motions: np.ndarray, block: Block, named: list[str], sigma: float = np.inf) -> str:
-    """Return a message: open motions, available observations, cure; `sigma` if only noise determines them (rad, or
-    relative).
+    """Return a message: undetermined motions, available observations, cure; `sigma` if only noise determines them (rad,
+    or relative).
     """
     names = motion_names(null_motions)
     counts = {rows.group: int(np.size(rows.observation)) for rows in block.observations if len(rows)}

@@ -25,7 +25,7 @@ from jaxphoto.compiling import jit_quickly
 _OPEN = 1e-9
 # Squared singular values below this are zero: limit of double precision.
 _OPEN_SQUARED = 1e-13
-# Squared singular values above this are nonzero for any rounding error.
+# Squared singular values above this are nonzero, whatever the rounding errors.
 _PLAIN = 1e-10
 # Number of rows per column that are triangularised at a time.
 _WIDE = 4
@@ -38,9 +38,9 @@ class SeenMotions:
     """d(rows / sigma) / d(motions, declared unknowns): columns of the seven motions, then one per unknown."""
 
     placed: scipy.sparse.csr_array
-    """Rows that touch images or points."""
+    """Rows that involve images or points."""
     alone: scipy.sparse.csr_array
-    """Rows that touch only declared unknowns."""
+    """Rows that involve only declared unknowns."""
 
     def null_motions(self) -> Float[np.ndarray, "defect 7"]:
         """Return orthonormal combinations of the seven motions that change no row; unknowns may compensate them.
@@ -50,7 +50,7 @@ class SeenMotions:
         open_ones = np.setdiff1d(np.arange(7, self.alone.shape[1]), self.determined)
         kept = np.concatenate([np.arange(7), open_ones])
         sensitivity = scipy.sparse.vstack([self.placed, self.alone]).tocsr()[:, kept].toarray()
-        # Most rows depend on none of these columns.
+        # Most rows are zero in these columns.
         sensitivity = sensitivity[sensitivity.any(axis=1)]
         if not len(sensitivity):
             return np.eye(7)
@@ -73,7 +73,7 @@ class SeenMotions:
         """Return the combinations of motions whose rotations and scale have a standard deviation above `sigma` (rad),
         and the largest standard deviation.
 
-        All unknowns compensate as far as their own rows allow.
+        Unknowns compensate a motion only as far as the sigmas of their own rows permit.
         """
         rows = scipy.sparse.vstack([self.placed, self.alone]).tocsr()
         normal = (rows.T @ rows).toarray()
@@ -116,7 +116,7 @@ def _determines_all(rows: scipy.sparse.csr_array) -> bool:
     squares = np.linalg.eigvalsh((rows.T @ rows).toarray())
     if squares[0] > _PLAIN * squares[-1]:
         return True
-    # The squares are inconclusive for the rest. The triangular factor has the singular values of its rows.
+    # Otherwise the squares are inconclusive. The triangular factor has the same singular values as `rows`.
     triangle: np.ndarray = np.zeros((0, n))
     for first in range(0, rows.shape[0], _WIDE * n):
         triangle = np.asarray(np.linalg.qr(np.vstack([triangle, rows[first : first + _WIDE * n].toarray()]), mode="r"))
@@ -127,7 +127,7 @@ def _determines_all(rows: scipy.sparse.csr_array) -> bool:
 def _eliminated(
     kept: Float[np.ndarray, "n n"], cross: Float[np.ndarray, "n k"], gone: Float[np.ndarray, "k k"]
 ) -> Float[np.ndarray, "n n"]:
-    """Eliminate some unknowns from the normal matrix; unknowns that touch no row change nothing."""
+    """Eliminate some unknowns from the normal matrix; unknowns that occur in no row change nothing."""
     size = np.sqrt(np.diag(gone))
     size = np.where(size > 0, size, 1.0)
     values, vectors = np.linalg.eigh(gone / size / size[:, None])
@@ -188,7 +188,7 @@ def _in_few_sizes(values: Values, s: Structure) -> tuple[Values, Structure]:
 
 @jit_quickly
 def _slopes(values: Values, s: Structure, motions: DatumRows):
-    """Return derivatives of the rows of each group with respect to the motions and the shared unknowns they touch."""
+    """Return derivatives of the rows of each group with respect to the motions and the shared unknowns they involve."""
     zero = zero_increments(s)
     one = jax.tree.map(jnp.ones_like, zero)
     slopes = []

@@ -128,7 +128,7 @@ class CoupledUnknowns(NamedTuple):
     """Unknowns eliminated with an image: exterior orientation, and camera parameters if `RayLists.by_image`."""
     of_points: Int[Array, "points c"]
     """Interior unknowns, constraints, the right-hand side (none), and unknowns that rows at the points of a group
-    touch.
+    involve.
     """
     interior: int
     """Number of interior unknowns in `of_points`."""

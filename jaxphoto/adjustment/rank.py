@@ -30,7 +30,7 @@ DEFECT = 1e-13
 def check_priors(block: Block, priors: Unknowns) -> None:
     """Raise RankError or DatumError for free unknowns that no observation can determine.
 
-    Uses only the unknowns that each observation touches, so nothing is compiled.
+    Uses only the unknowns that each observation involves, so nothing is compiled.
     """
     _check_scales(priors)
     with_station = _images_of_stations(block)
@@ -53,13 +53,13 @@ def _images_of_stations(block: Block) -> set[int]:
 
 
 def _images_touched(block: Block) -> set[int]:
-    """Return the images that further observations touch."""
+    """Return the images that other observations involve."""
     rows = [of for of in block.more if isinstance(of, AbstractObservations)]
     return {int(i) for of in rows for what, index in of.indices() if what == "image" for i in np.ravel(index)}
 
 
 def _check_scales(priors: Unknowns) -> None:
-    """Raise RankError if a camera's principal distance and a coefficient of the same effect are both free.
+    """Raise RankError if a camera's principal distance and an equivalent coefficient are both free.
 
     The normal matrix would not be singular. Residuals refer to ideal coordinates, so a smaller scale reduces the
     residuals, and the sum of squares has no minimum.

@@ -40,7 +40,7 @@ def prepare_solving(equations: NormalEquations, seconds: dict[str, float]) -> No
 
 
 def blank(one: Increments, many: int) -> Increments:
-    """Return abstract right-hand sides, without memory."""
+    """Return abstract right-hand sides, without allocating memory."""
     return jax.tree.map(lambda v: np.broadcast_to(0.0, (many, *v.shape)), one)
 
 

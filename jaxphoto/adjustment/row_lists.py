@@ -7,9 +7,9 @@ from jaxtyping import Float, Int
 from jaxphoto.adjustment.layout.rays import Places
 from jaxphoto.adjustment.model.structure import Structure
 
-# Usual, maximum and minimum number of draws that a device computes together (last axis). 32 suffice for vectorisation
-# and to recompute intermediates (`solver.elimination`). More are used while image rows x draws stay below the fourth
-# value, fewer if unknowns x draws exceed the fifth: several such arrays are in memory.
+# Default, maximum and minimum number of draws that a device computes together (last axis). 32 suffice for vectorisation
+# and to recompute intermediates (`solver.elimination`). More are used while image rows x draws are below `_ROWS`, fewer
+# if unknowns x draws exceed `_UNKNOWNS`: several such arrays are in memory.
 _FEW, _MOST, _LEAST = 32, 64, 8
 _ROWS, _UNKNOWNS = 100_000, 8_000_000
 # Number of image rows x draws processed at a time: intermediate arrays then fit in the cache of a core.
@@ -24,7 +24,7 @@ def batch_size(structure: Structure) -> int:
 
 
 class RowList(eqx.Module):
-    """Image rows of the cameras of one group, in chunks: index in the block, and the objects they touch.
+    """Image rows of the cameras of one group, in chunks: index in the block, and the objects they involve.
 
     Images and points are indices into a padded structure, points ascending. The last chunk repeats its last row, with
     zero weight.

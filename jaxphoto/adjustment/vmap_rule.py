@@ -27,7 +27,7 @@ from jaxphoto.adjustment.solver.normal import Linearised
 from jaxphoto.adjustment.solver.optimum import Optimum, iterate
 from jaxphoto.rotation import small_angles
 
-# Maximum number of factors tried before the remaining draws are adjusted individually.
+# Maximum number of factorisations tried before the remaining draws are adjusted individually.
 _FACTORS = 3
 # Leaves of `Values` that hold start values; leaves that define the datum and are computed from the start values.
 _STARTS, _DATUM = {"position", "rotation", "shared", "points"}, {"datum_eop", "datum_points"}

@@ -1,12 +1,12 @@
 """Weak directions: combinations of unknowns that the observations hardly determine, from the normal equations.
 
-Unknowns are scaled by yardsticks: the change that moves an image point by about its standard deviation or, if larger,
+The scale of an unknown is the change that moves an image point by about its standard deviation or, if larger,
 the standard deviation of the observed positions or attitudes. With C the covariance of all scaled unknowns,
 
     C u = mu u,    |u| = 1
 
-a direction u of large mu is weak: within one standard deviation unknown k moves by u_k sqrt(mu). A standard deviation
-in yardsticks is the dilution of precision of GNSS: the factor by which geometry amplifies observation errors. The
+a direction u of large mu is weak: within one standard deviation unknown k moves by u_k sqrt(mu). A scaled standard
+deviation is the dilution of precision of GNSS: the factor by which geometry amplifies observation errors. The
 directions are computed by subspace iteration with the factored normal matrix. If that may be singular, slight damping
 gives an undetermined direction a very large, finite standard deviation.
 """
@@ -32,11 +32,11 @@ from jaxphoto.arrays import to_numpy
 from jaxphoto.compiling import call_compiled
 
 POOR = 20.0
-"""Standard deviation in yardsticks above which an unknown is weak. In GNSS a dilution of precision above 20 is poor
-(Langley, Dilution of precision, GPS World 10(5), 1999).
+"""Scaled standard deviation above which an unknown is weakly determined. In GNSS a dilution of precision above 20 is
+poor (Langley, Dilution of precision, GPS World 10(5), 1999).
 """
 OPEN = 1e4
-"""Standard deviation in yardsticks above which a direction is undetermined: only damping or noise remains."""
+"""Scaled standard deviation above which a direction is undetermined: only damping or noise remains."""
 # Damping relative to the diagonal of N: larger than rounding errors, smaller than the contribution of any observation.
 _DAMPING = 1e-12
 # Smallest pivot of the reduced unknowns above which damping is omitted: it would change them by a millionth. Points
@@ -56,7 +56,7 @@ class Yardsticks(NamedTuple):
 
 
 class MovedUnknowns(NamedTuple):
-    """Motions of all unknowns, in block order and in yardsticks."""
+    """Motions of all unknowns, in block order, divided by their scales."""
 
     exterior: Float[np.ndarray, "images 6"]
     """X, Y, Z and a small rotation in the camera frame."""
@@ -70,7 +70,7 @@ class MovedUnknowns(NamedTuple):
 
 
 class WeakDirection(NamedTuple):
-    """One standard deviation along a direction, in yardsticks."""
+    """One standard deviation along a direction, in scaled unknowns."""
 
     moved: MovedUnknowns
     share: Float[np.ndarray, "shared"]
@@ -80,7 +80,7 @@ class WeakDirection(NamedTuple):
 
     @property
     def sigma(self) -> float:
-        """Standard deviation of the unknown that moves most, in yardsticks."""
+        """Scaled standard deviation of the unknown that moves most."""
         return self.moved.largest
 
     def _moves(self, motion: Float[np.ndarray, "n k"]) -> np.ndarray:
@@ -104,8 +104,8 @@ class WeakDirection(NamedTuple):
 
 
 def yardsticks(adjusted: Adjustment) -> Yardsticks:
-    """Return the yardsticks of the unknowns of `adjusted`."""
-    # If the optimum does not fit, a camera may be inverted, with negative c and yardsticks.
+    """Return the scales of the unknowns of `adjusted`."""
+    # If the optimum does not fit, a camera may be inverted, with negative c and scales.
     scale, block = jax.tree.map(lambda v: np.abs(to_numpy(v)), adjusted.equations.scale), adjusted.block
     ground = float(max(scale.eop[:3].max(initial=0.0), scale.points.max(initial=0.0)))
     angle = float(scale.eop[3:].max(initial=0.0))
@@ -126,7 +126,7 @@ def _unit(label: str) -> str:
 
 
 def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirection]:
-    """Return directions with standard deviations above `least` yardsticks, the weakest first, a dozen at most.
+    """Return directions with scaled standard deviations above `least`, the weakest first, at most twelve.
 
     Evaluated at the unknowns of `adjusted`: the optimum, or the last iterate. None if any unknown is infinite. The
     standard deviations are a priori.
@@ -136,7 +136,7 @@ def weak_directions(adjusted: Adjustment, least: float = POOR) -> list[WeakDirec
     scale = jax.tree.map(to_numpy, equations.scale)
     sizes = np.repeat([yard.ground, yard.angle], 3)[:, None]
     units = _increments(np.where(scale.eop > 0, sizes, 0.0), yard.shared, np.where(scale.points > 0, yard.ground, 0.0))
-    # Yardsticks in scaled increments, and their reciprocals; zero for fixed unknowns.
+    # Scales in units of the scaled increments, and their reciprocals; zero for fixed unknowns.
     over = jax.tree.map(lambda s, u: np.where(u > 0, s / np.where(u > 0, u, 1.0), 0.0), scale, units)
     flat = _flat(over)
     rng, free = np.random.default_rng(0), np.flatnonzero(flat > 0)

@@ -34,7 +34,7 @@ class WeakUnknowns(NamedTuple):
     sentence: str
     labels: frozenset[str]
     sigma: float
-    """Standard deviation in yardsticks."""
+    """Scaled standard deviation (`adjustment.yardsticks`)."""
     points: tuple[int, ...] = ()
     """Points that may lie anywhere along their rays, if no other unknowns participate."""
 
@@ -78,13 +78,13 @@ class _Words:
     def harmless(self, d: WeakDirection) -> bool:
         """Return True if only images move and their projections remain valid: a rotation compensates a shift.
 
-        Images of few points do so in valid blocks, if the position of a new point in the middle or a corner, as
-        projected by the image, changes by less than `POOR` yardsticks.
+        This occurs in valid blocks for images with few points. Criterion: the projections of new points in the middle
+        and the corners of the image change by less than `POOR` times their scale.
         """
         images = d.images
         if not (len(images) or len(d.shared) or len(d.points)):
-            # If most of the variance of the parameter that moves most is due to another direction, that direction
-            # reports it.
+            # Skip this direction: most of the variance of its most affected parameter is due to another direction,
+            # which reports it.
             return True
         if not len(images) or len(d.shared) or np.abs(d.moved.points).max(initial=0.0) > POOR:
             return False
@@ -229,7 +229,7 @@ class _Words:
         seen = np.concatenate([d.moved.exterior[images].ravel(), d.moved.points[points].ravel()])
         found, *_ = np.linalg.lstsq(columns, seen, rcond=None)
         left = np.sum((seen - columns @ found) ** 2) / np.sum(seen**2)
-        # Without points, images alone determine little: a similarity also moves their points.
+        # Require points: a motion of images alone is not a similarity, which would also move their points.
         return found / np.abs(found).max() if left < 1 - _RIGID and len(points) else None
 
     def _coordinates(self, d: WeakDirection) -> str:

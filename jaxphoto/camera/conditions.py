@@ -38,7 +38,7 @@ class Conditions(NamedTuple):
 
     @property
     def camera(self) -> str:
-        """Return make and model. Some makes are repeated in the model name."""
+        """Return make and model. Some model names already contain the make."""
         name = next(iter(self.make.split()), "")
         told = self.model.lower().startswith(name.lower())
         return self.model if told else f"{self.make} {self.model}".strip()

@@ -89,8 +89,8 @@ def fitted(
     first = _plain(interior, target, sensor, interior.projection if projection is None else projection)
     if not np.all(np.asarray(first.projection.sees(*rays.T))):
         raise ValueError(
-            f"this camera sees directions within its format that the projection {first.projection.name} does not: "
-            f"choose one that does, such as equidistant"
+            f"the projection {first.projection.name} does not cover all directions in the format of this camera: "
+            "choose one that does, such as equidistant"
         )
     found = _fit(first, sensor, points, rays, (*scales, *rare))
     if rare and not found.max_px <= _GOOD_PX:

@@ -52,7 +52,7 @@ def lens_priors() -> tuple[tuple[tuple[str, ...], tuple[str, ...], LensPrior], .
 def lens_prior(make: str | None, model: str | None) -> LensPrior:
     """Return the prior of a camera by make and model in EXIF (None if missing)."""
     make, model = (make or "").strip(), (model or "").strip()
-    # Some makes are repeated in the model name.
+    # Some model names already contain the make.
     told = {f"{make} {model}".lower(), f"{make.split(' ')[0]} {model}".lower(), model.lower()}
     for models, makes, prior in lens_priors():
         if model in models or any(name.startswith(own.lower()) for own in makes for name in told):

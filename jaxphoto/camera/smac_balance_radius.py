@@ -30,7 +30,7 @@ def rebalance(interior: InteriorOrientation, r0_mm: Float[Array, ""] | float) ->
     to_new = 1 + d.signum * (k / to_zero) @ new
     factor = 1 / (to_zero * to_new)
     singular = ~jnp.isfinite(factor) | (to_zero * to_new <= 0)
-    factor = eqx.error_if(factor, singular, f"R0 = {r0_mm} mm is where SMAC is singular: use a smaller one")
+    factor = eqx.error_if(factor, singular, f"SMAC is singular at R0 = {r0_mm} mm: use a smaller R0")
     k1, k2, k3, k4 = k * factor
     smac = Smac(
         k0=jnp.zeros_like(factor), k1=k1, k2=k2, k3=k3, k4=k4, p1=d.p1 * factor, p2=d.p2 * factor,

@@ -68,7 +68,7 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
     try:
         result = program(arrays)
     except Exception:
-        # A valid file may still fail on this machine: this appears only in the call, as various errors.
+        # A valid file may still fail on this machine; the call then raises one of various errors.
         if not program.loaded:
             raise
         program = _program_of(function.__wrapped__, arguments, thorough, recompile=True)()

@@ -140,7 +140,7 @@ def _settings() -> list[str]:
     """List all settings of JAX, XLA and equinox in this process and around this call; some change the code."""
     kept = ("JAX_", "XLA_", "EQX_")
     chosen = [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(kept)]
-    # Temporary settings (`with jax.enable_x64(False)`) are visible as attributes only, and some options are not.
+    # Temporary settings (`with jax.enable_x64(False)`) are visible only as attributes; some options have no attribute.
     values = {name: getattr(jax.config, name, value) for name, value in jax.config.values.items()}
     chosen += [f"{name}={value}" for name, value in sorted(values.items())]
     return [line for line in chosen if "cache" not in line.lower().split("=")[0]]

@@ -134,7 +134,7 @@ def plot_comparison(comparison: pd.DataFrame, table: str, column: str, ax: Axes 
     if of.empty:
         known = ", ".join(dict.fromkeys(cells["column"]))
         raise ValueError(
-            f"{table!r}: column {column!r} has no printed value with a result of ours; choose among {known}"
+            f"{table!r}: column {column!r} has no cell that is both printed and computed; choose among {known}"
         )
     ax, at = axes_or_new(ax), np.array([rows.index(row) for row in of["row"]])
     bars: dict[str, Any] = {"capsize": 2, "lw": 1, "ls": "none"}
@@ -169,7 +169,7 @@ def _both(comparison: pd.DataFrame, table: str) -> pd.DataFrame:
     """Return the cells of a table that are both published and computed."""
     cells = comparison[(comparison["table"] == table) & comparison["published"].notna() & comparison["ours"].notna()]
     if cells.empty:
-        raise ValueError(f"{table!r}: no printed value has a result of ours")
+        raise ValueError(f"{table!r}: no cell is both printed and computed")
     return cells
 
 
@@ -180,7 +180,7 @@ def plot_agreement(comparison: pd.DataFrame, ax: Axes | None = None) -> Axes:
     """
     cells = comparison[comparison["within"] != ""]
     if cells.empty:
-        raise ValueError("no printed value with a result of ours has a tolerance")
+        raise ValueError("no cell that is both printed and computed has a tolerance")
     ax = axes_or_new(ax)
     off = ((cells["ours"] - cells["published"]) / cells["tolerance"]).to_numpy(float)
     place, tables = pd.factorize(cells["table"])

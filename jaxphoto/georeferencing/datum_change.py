@@ -96,7 +96,7 @@ def datum_change(code: int, longitude_deg: float, latitude_deg: float) -> DatumC
     if not group.transformers:
         raise InputError(
             f"PROJ has no transformation from WGS 84 to the datum of EPSG:{code} ({system.name}) at "
-            f"{longitude_deg:.3f}, {latitude_deg:.3f} degrees; give a CRS of the place"
+            f"{longitude_deg:.3f}, {latitude_deg:.3f} degrees; give a CRS that covers this position"
         )
     best = group.transformers[0]
     accuracy = None if "Ballpark" in best.description or best.accuracy < 0 else float(best.accuracy)

@@ -22,10 +22,11 @@ class StripBias(AbstractParameters):
 
 
 class FlightBias(AbstractParameters):
-    """Shift (m) and drift (m/s) of the GNSS positions of the whole block: error of datum or reference station.
+    """Shift (m) and drift (m/s) of the GNSS positions of the whole block, due to the datum or the reference station.
 
     Strips may have additional biases. Strip or flight biases then need prior information: weighted strip biases scatter
-    about the flight bias, which control determines. Time counts from the middle of the flight (`Exposure.in_flight`).
+    about the flight bias, which control determines. Time is measured from the middle of the flight
+    (`Exposure.in_flight`).
     """
 
     kind = "flight_bias"

@@ -155,7 +155,7 @@ def one_height(
         result, messages = _above_ellipsoid(result, wanted)
     elif wanted is not None:
         if wanted == "take-off" and known:
-            messages.append("no photograph has a height above take-off: the heights of the files are used as such")
+            messages.append("no photograph has a height above take-off: the heights of the files are used unchanged")
         result = {n: g and g._replace(heights=wanted) for n, g in result.items()}
     elif known:
         kinds = list(known.values())
@@ -163,7 +163,7 @@ def one_height(
         for kind in dict.fromkeys(kind for kind in kinds if kind != usual):
             names = [n for n, k in known.items() if k == kind]
             messages.append(
-                f"the heights of {_names(names)} are {HEIGHTS[kind]}, those of most {HEIGHTS[usual]}: the former are "
+                f"the heights of {_names(names)} are {HEIGHTS[kind]}, but most are {HEIGHTS[usual]}: the former are "
                 "not used (set the reference by --heights)"
             )
             result |= {n: g._replace(altitude_m=None) for n in names if (g := result[n])}
@@ -185,7 +185,7 @@ def _above_ellipsoid(positions: Positions, vertical: int) -> tuple[Positions, li
     }
     if not places:
         any_height = any(g and g.altitude_m is not None for g in positions.values())
-        reason = "the files give all above the ellipsoid" if any_height else "no photograph has one"
+        reason = "all heights in the files are ellipsoidal" if any_height else "no photograph has one"
         return positions, [f"no height needs the geoid of EPSG:{vertical}: {reason}"]
     given = np.array(list(places.values()), float)
     heights, result = system.place(given)[:, 2], dict(positions)
@@ -193,7 +193,7 @@ def _above_ellipsoid(positions: Positions, vertical: int) -> tuple[Positions, li
         if not np.isfinite(height):
             raise InputError(
                 f"the geoid of the heights EPSG:{vertical} does not cover the photograph {quoted(name)} at "
-                f"{place[0]:.4f}, {place[1]:.4f} degrees; give the vertical CRS of that place"
+                f"{place[0]:.4f}, {place[1]:.4f} degrees; give a vertical CRS that covers it"
             )
         if gps := result[name]:
             result[name] = gps._replace(altitude_m=height, heights="ellipsoid")
@@ -211,7 +211,7 @@ def _reference(positions: Positions) -> str:
         return "heights are above the ellipsoid"
     if kind == "unknown":
         return "heights are as in the files, of unknown reference (set it by --heights)"
-    return f"heights are {HEIGHTS[kind]}; nothing is added to bring them to the ellipsoid"
+    return f"heights are {HEIGHTS[kind]}; they are not converted to ellipsoidal heights"
 
 
 def _on_sphere(gps: Gps) -> np.ndarray:

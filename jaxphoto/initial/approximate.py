@@ -175,8 +175,8 @@ class _State:
                     f"has no position{more}: measure it in a second image, give its coordinates, or remove it"
                 )
             raise BlockError(
-                f"the rays of point {block.points[first]} from {rays} images are nearly parallel, so they do not meet "
-                f"in a point{more}: measure it from another position, give its coordinates, or remove it"
+                f"the rays of point {block.points[first]} from {rays} images are nearly parallel and have no "
+                f"intersection{more}: measure it from another position, give its coordinates, or remove it"
             )
         interior = block.start.unknowns.interior
         bad = np.flatnonzero(~_in_front(block, interior, self.positions, self.matrices, self.points))

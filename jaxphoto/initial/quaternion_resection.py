@@ -87,9 +87,9 @@ def resect_by_quaternions(
 
     Raises BlockError for: fewer than four distinct points (three have up to four solutions); a coordinate that is not a
     number; points on a line or in a plane with the projection centre; a standard deviation above 0.1 of the distance or
-    0.1 rad; errors not described by a covariance (projection centre and points on a dangerous curve or cylinder); two
-    orientations that fit equally well (small flat figures seen from afar); points that no orientation fits. Raises
-    ValueError if `sigma_mm` is not positive or the numbers of points and coordinates differ.
+    0.1 rad; errors not described by a covariance (projection centre and points on a critical curve or danger cylinder);
+    two orientations that fit equally well (small planar figures at a large distance); points that no orientation fits.
+    Raises ValueError if `sigma_mm` is not positive or the numbers of points and coordinates differ.
     """
     c, ideal = float(interior.c), ideal_coordinates(interior, np.asarray(xy_mm, float))
     if not sigma_mm > 0:
@@ -209,8 +209,8 @@ def _moved(refined: RefinedResections, k: int, steps: Float[np.ndarray, "steps 6
 def _alternatives(c, ideal, points, refined: RefinedResections):
     """Return positions and matrices of other orientations in which the points may appear the same.
 
-    Steps to both sides along the weakest direction reach the second orientation across a dangerous cylinder. For a
-    distant flat figure: half a turn about its normal, and another about the line of sight.
+    Steps to both sides along the weakest direction reach the second orientation across a danger cylinder. For a
+    distant flat figure: a rotation by 180 degrees about its normal, or about the line of sight.
     """
     best = refined.best(len(points))
     position, matrix = refined.positions[best], refined.matrices[best]

@@ -45,7 +45,7 @@ def _of_rows(interior: InteriorOrientation, xy_mm: Float[np.ndarray, "rows 2"]) 
     n = len(xy_mm)
     xy = np.zeros((padded_length(n), 2))
     xy[:n] = xy_mm
-    # Convert floats to arrays: as constants each camera would need its own compiled program.
+    # Convert floats to arrays: constants would require a separate compiled program for each camera.
     numbers = jax.tree.map(partial(np.asarray, dtype=float), interior)
     return np.asarray(directions_of(numbers, xy))[:n]
 

@@ -220,7 +220,8 @@ def _refined(positions, matrices, observed, points, used, limit):
             residual = observed - in_camera[:, :2] / jnp.where(depth == 0, 1e-100, depth)
             # The squares of r sqrt(log(1 + q) / q) are Cauchy's loss.
             q = jnp.sum(residual**2, axis=1, keepdims=True) / limit**2 + 1e-30
-            # Blunders may lie behind the best candidate, but no step may increase the number of points there.
+            # With the best candidate, blunders may lie behind the camera, but no step may increase the number of points
+            # there.
             behind = jnp.sqrt(jnp.sum(used) * jnp.sum(used * (depth[:, 0] <= 0)))
             return jnp.append(residual * used[:, None] * jnp.sqrt(jnp.log1p(q) / q), behind)
 
@@ -288,8 +289,8 @@ def checked_points(
 def no_orientation(image: str) -> BlockError:
     """Return the error for points that match no orientation of the image."""
     return BlockError(
-        f"no position and attitude of image {image} brings its known points near their images: check their ids, "
-        "the units and axes of the image coordinates, and c_mm"
+        f"resection of image {image} failed: no orientation fits its known points; check their ids, the units and axes "
+        "of the image coordinates, and c_mm"
     )
 
 
@@ -307,7 +308,7 @@ def open_orientation(image: str) -> BlockError:
     """Return the error for points that do not determine the orientation."""
     return BlockError(
         f"the known points of image {image} leave its orientation undetermined (near a line, few in a small "
-        "part of the image, or on a dangerous cylinder or curve through the projection centre): "
+        "part of the image, or on a danger cylinder or critical curve through the projection centre): "
         "measure known points elsewhere in it"
     )
 

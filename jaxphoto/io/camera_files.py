@@ -179,7 +179,7 @@ def read_camera_file(
             raise InputError(f"{path} contains none of {', '.join(_IN_FOLDER)}; name the camera file")
         path = inside[0]
     if not path.is_file():
-        raise InputError(f"there is no file {path}; correct the name")
+        raise InputError(f"file not found: {path}; correct the name")
     source = CameraSource(path, camera, pixel_mm, size_px, Path(block) if block is not None else None)
     text = "" if path.name == "cameras.bin" else source.text()
     for reader in camera_readers().values():

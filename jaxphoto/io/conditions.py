@@ -95,7 +95,7 @@ def read_conditions(path: Path) -> list[Conditions]:
         raise InputError(f"{path.name}: not a table of photographs ({error}); rewrite the results") from None
     if not valid.all() or table.empty:
         where = f", row {int(np.argmin(valid)) + 2}" if len(table) else ""
-        raise InputError(f"{path.name}{where}: no photograph with sha256 and used; rewrite the results")
+        raise InputError(f"{path.name}{where}: invalid sha256 or used; rewrite the results")
     rows = table.to_dict("records")
     for name, values in numbers.items():
         for row, value in zip(rows, values.tolist(), strict=True):

@@ -82,7 +82,7 @@ class Cells(NamedTuple):
             return np.nan
         value = self.number(k, column, name)
         if value <= 0:
-            raise self.bad(k, f"{name} is {value:g}; a standard deviation is positive, so give its true value")
+            raise self.bad(k, f"{name} is {value:g}; a standard deviation is positive; correct it")
         return value
 
 

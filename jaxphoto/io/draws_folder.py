@@ -49,7 +49,7 @@ class DrawsFolder:
         for name in [name for name in {**held, **wanted} if held.get(name) != wanted.get(name)][:1]:
             raise InputError(
                 f"{self.directory} has a run with other settings ({name} {held.get(name)}, now {wanted.get(name)}): "
-                "name a new folder, or use the settings of that run to continue it"
+                "use a new folder, or the settings of that run to continue it"
             )
 
     @property
@@ -77,7 +77,7 @@ class DrawsFolder:
         """Lock the folder against other processes. Raises InputError if another run uses it."""
         with locked(self.directory / _PARTS) as own:
             if own is False:
-                raise InputError(f"another run is drawing into {self.directory}: wait for it, or name a new folder")
+                raise InputError(f"another run is drawing into {self.directory}: wait for it, or use a new folder")
             yield
 
     def write_part(self, k: int, table: pd.DataFrame) -> None:
@@ -144,7 +144,7 @@ def check_place(directory: Path) -> None:
     """Raise InputError if no run can be written: `directory` is a file, or contains other files."""
     for path in (directory, *directory.parents):
         if path.is_file():
-            raise InputError(f"{path} is a file: name a folder for the draws")
+            raise InputError(f"{path} is a file: give a folder for the draws")
     known = not directory.is_dir() or (directory / _RUN).is_file()
     if not known and any(not is_place(path.name) for path in directory.iterdir()):
         raise InputError(f"{directory} is not empty and has no Monte Carlo run: give a new folder")

@@ -1,6 +1,6 @@
 """Photographs: metadata of their files, initial interior orientation, and selection of the valid ones of a folder.
 
-Pictures are used as stored, in sensor orientation: the EXIF orientation flag is not applied.
+Photographs are used as stored, in sensor orientation: the EXIF orientation flag is not applied.
 
 | make | namespace | position | attitude |
 | --- | --- | --- | --- |
@@ -253,7 +253,7 @@ _USUAL_C, _USUAL_C_SIGMA = 1.2, 0.5
 _NOMINAL_PIXEL_MM = 0.005
 _UNIT_MM = {2: 25.4, 3: 10.0, 4: 1.0, 5: 0.001}
 SUFFIXES = (".jpg", ".jpeg", ".png", ".tif", ".tiff")
-"""File name extensions of pictures."""
+"""File name extensions of photographs."""
 
 
 class Photograph(NamedTuple):
@@ -309,9 +309,9 @@ def photographs(paths: Sequence[str | Path]) -> list[Photograph]:
 def read_photograph(path: Path) -> Photograph:
     """Read the metadata of a photograph. Raises InputError for a missing file or another format."""
     if path.is_dir():
-        raise InputError(f"{path} is a folder; name its photographs, for example {path}/*.jpg")
+        raise InputError(f"{path} is a folder; give its photographs, for example {path}/*.jpg")
     if not path.is_file():
-        problem = "the target of this link is missing" if path.is_symlink() else "there is no such photograph"
+        problem = "the target of this link is missing" if path.is_symlink() else "photograph not found"
         raise InputError(f"{path}: {problem}; correct the name")
     try:
         with open_picture(path) as picture:
@@ -350,7 +350,7 @@ def _photograph(path: Path, width_px: int, height_px: int, exif: Exif) -> Photog
 
 
 def _sensor_width(shot: Mapping, width_px: int, height_px: int) -> float | None:
-    """Return the sensor width (mm) from image size and focal plane resolution in EXIF; None for cropped pictures."""
+    """Return the sensor width (mm) from image size and focal plane resolution in EXIF; None for cropped photographs."""
     resolution = number(shot.get(TAG.FocalPlaneXResolution), positive=True)
     unit = _UNIT_MM.get(shot.get(TAG.FocalPlaneResolutionUnit, 2))
     if resolution is None or unit is None:
@@ -374,7 +374,7 @@ def sensor_and_interior(
     Raises InputError without photographs, for different cameras (`ONE_CAMERA`), and for c_mm without a pixel size.
     """
     if not photographs:
-        raise InputError("no photographs; name the files of one camera")
+        raise InputError("no photographs; give the files of one camera")
     for name, value in (("pixel_mm", pixel_mm), ("c_mm", c_mm)):
         if value is not None and not (math.isfinite(value) and value > 0):
             raise InputError(f"{name} is {value:g}; give a positive number of millimetres")
@@ -436,9 +436,9 @@ ONE_CAMERA: list[tuple[str, Callable[[Photograph], Hashable], str]] = [
     ("size", lambda p: f"{p.width_px} x {p.height_px} px", "give those of one camera, neither cropped nor resized"),
     (
         "orientation flag",
-        # Ignore flags of a rotation by 90 degrees: the picture has the size of the others, so it is not rotated yet.
+        # Ignore flags of a rotation by 90 degrees: a photograph of the size of the others is not rotated yet.
         lambda p: None if p.orientation > 4 and p.width_px != p.height_px else p.orientation,
-        "a program may have rotated some: if all are as the sensor saw them, set one flag (exiftool -n -Orientation=1 "
+        "a program may have rotated some: if all are in sensor orientation, set one flag (exiftool -n -Orientation=1 "
         "FILES), else omit the rotated ones",
     ),
     ("camera", lambda p: " ".join(filter(None, (p.make, p.model))) or None, "give the photographs of one camera"),
@@ -458,7 +458,7 @@ def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
     """
     files = list(dict.fromkeys(picture_files(paths)))
     if missing := [file for file in files if not (file.is_file() or file.is_symlink())]:
-        raise InputError(f"{missing[0]}: there is no such photograph or folder; correct the name")
+        raise InputError(f"{missing[0]}: photograph or folder not found; correct the name")
     skipped: dict[str, str] = {}
     originals: dict[str, Photograph] = {}
     by_name: dict[str, Photograph] = {}
@@ -486,7 +486,7 @@ def valid_photographs(paths: Sequence[str | Path]) -> tuple[list[Photograph], di
         valid = [p for p in valid if str(p.path) not in skipped]
     if not valid:
         hints = [*skipped.values(), *skipped_subfolders(paths).values()][:1]
-        raise InputError("; ".join([f"{', '.join(map(str, paths))}: there is no photograph that can be read", *hints]))
+        raise InputError("; ".join([f"{', '.join(map(str, paths))}: none is a readable photograph", *hints]))
     return valid, skipped
 
 
@@ -505,7 +505,7 @@ def skipped_messages(skipped: Mapping[str, str]) -> list[str]:
 
 
 def picture_files(paths: Sequence[str | Path]) -> list[Path]:
-    """List the files among `paths`, and the pictures in the folders among them, by name; hidden files are skipped."""
+    """List the files in `paths`, and the photographs in folders of `paths`, by name; hidden files are skipped."""
     files = []
     for path in map(Path, paths):
         inner = sorted(f for f in path.iterdir() if not f.name.startswith(".")) if path.is_dir() else []
@@ -514,7 +514,7 @@ def picture_files(paths: Sequence[str | Path]) -> list[Path]:
 
 
 def skipped_subfolders(paths: Sequence[str | Path]) -> dict[str, str]:
-    """Return subfolders with pictures that are not in `paths`, with a message each; not those that jaxphoto wrote."""
+    """Return subfolders with photographs that are not in `paths`, with a message each; not those that jaxphoto wrote."""
     named, messages = {Path(path).resolve() for path in paths}, {}
     folders = (path for path in map(Path, paths) if path.is_dir())
     for inner in (inner for folder in folders for inner in sorted(folder.iterdir())):
@@ -522,7 +522,9 @@ def skipped_subfolders(paths: Sequence[str | Path]) -> dict[str, str]:
         if readable and inner.resolve() not in named and not (inner / MARKER).exists():
             n = sum(f.suffix.lower() in SUFFIXES and f.suffix.lower() != ".png" for f in inner.iterdir())
             if n:
-                messages[str(inner)] = f"{inner}: {counted(n, 'picture')} in a folder that is not named; name it, too"
+                messages[str(inner)] = (
+                    f"{inner}: {counted(n, 'photograph')} in a subfolder that is not read; add this folder"
+                )
     return messages
 
 

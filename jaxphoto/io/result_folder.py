@@ -70,7 +70,7 @@ def adjusted_block(folder: str | Path, block: str | Path | None = None, part: in
 def photograph_files(images: Sequence[str], folders: Iterable[Path], flight: Path | None = None) -> dict[str, str]:
     """Return the photograph's file name of each image: from `folders`, else from the table of a `flight`.
 
-    Raises InputError if two pictures in `folders` belong to one image.
+    Raises InputError if two photographs in `folders` belong to one image.
     """
     pictures: dict[str, Path] = {}
     for folder in folders:
@@ -116,7 +116,7 @@ def _sources(folder: Path, block: Path | None, part: int) -> tuple[Path, Path]:
         names = parts[part - 1] if isinstance(parts[part - 1], dict) else {}
         inside = [_below(folder, names.get(key)) for key in ("result", "block")]
         if inside[0] is None or inside[1] is None:
-            raise InputError(f"{folder / SUMMARY} has no folder for part {part}; fly again")
+            raise InputError(f"{folder / SUMMARY} has no folder for part {part}; repeat jaxphoto fly")
         result, block = inside[0], block or inside[1]
     elif not (folder / INTERIOR).is_file():
         raise InputError(f"{folder} has no {INTERIOR}; give a folder that jaxphoto adjust or jaxphoto fly wrote")

@@ -17,9 +17,9 @@ def read_bytes(path: Path) -> bytes:
     try:
         return path.read_bytes()
     except (FileNotFoundError, NotADirectoryError):
-        raise InputError(f"there is no file {path}; add it, or correct the name") from None
+        raise InputError(f"file not found: {path}; add it, or correct the name") from None
     except IsADirectoryError:
-        raise InputError(f"{path} is a folder; name a file") from None
+        raise InputError(f"{path} is a folder; give the path of a file") from None
     except OSError as error:
         raise InputError(f"{path.name} cannot be read ({error.strerror}); check that it is a readable file") from None
 

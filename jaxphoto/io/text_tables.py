@@ -115,7 +115,7 @@ class Table:
         values = self.numbers(column, empty=True)
         self.check(
             values <= 0,
-            lambda line: f"{column} is {values[line]:g}; a standard deviation is positive, so give its true value",
+            lambda line: f"{column} is {values[line]:g}; a standard deviation is positive; correct it",
         )
         return values
 

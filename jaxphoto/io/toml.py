@@ -138,7 +138,7 @@ class Section:
             return Weighted(as_jax_array(value), covariance=as_jax_array(matrix * scale**2))
         sigma = self._numbers(key, given["sigma"], np.shape(start)) * scale
         if not np.all(sigma > 0):
-            raise self.error(key, f'sigma = {given["sigma"]} is not positive; give the true one or "fixed"')
+            raise self.error(key, f'sigma = {given["sigma"]} is not positive; correct it, or write "fixed"')
         return Weighted(as_jax_array(value), as_jax_array(sigma))
 
     def covariance(self, key: str, rows: Any, size: int) -> np.ndarray:
@@ -205,10 +205,10 @@ _SENTENCES = {
     "finite_number": _FINITE,
     "int_type": _WHOLE,
     "int_from_float": _WHOLE,
-    "greater_than": "{input} is not positive; give the true value",
-    "greater_than_equal": "{input} is less than {ge:g}; give the true value",
-    "less_than": "{input} is not below {lt:g}; give the true value",
-    "less_than_equal": "{input} exceeds the maximum {le:g}; give the true value",
+    "greater_than": "{input} is not positive; correct it",
+    "greater_than_equal": "{input} is less than {ge:g}; correct it",
+    "less_than": "{input} is not below {lt:g}; correct it",
+    "less_than_equal": "{input} exceeds the maximum {le:g}; correct it",
     "too_short": "{input} has {actual_length} entries; give {min_length}",
     "too_long": "{input} has {actual_length} entries; give {max_length}",
     "bool_type": "{input} is neither true nor false; write one of them",

@@ -119,7 +119,7 @@ def _checked(records: Records, rows: np.ndarray, row: str) -> Records:
     for k in np.flatnonzero(np.diff(time) <= 0)[:1]:
         raise InputError(
             f"{file}, {row} {rows[k + 1]}: the time {time[k + 1]:.6f} s does not come after {time[k]:.6f} s before it; "
-            "sort the records, delete doubles, and add 604800 s to the times after the end of a GPS week"
+            "sort the records, delete duplicates, and add 604800 s to the times after the end of a GPS week"
         )
     places = records.coordinates[:, :2] if records.geographic else np.zeros((0, 2))
     for names, values, limit in ((("longitude", "latitude"), places, [360, 90]), (_ANGLES, angles, 360)):

@@ -20,7 +20,7 @@ from jaxphoto.errors import InputError
 _PER_CELL = 4
 # Sample size for estimating the cell size.
 _SAMPLE = 200_000
-# Fraction of the points beyond each border, if isolated points would make the grid too large.
+# Fraction of the points that may lie beyond each border if isolated points would make the grid too large.
 _OUTSIDE = 1e-3
 # LAS classes of low, medium and high vegetation.
 _VEGETATION = (3, 4, 5)

@@ -481,7 +481,7 @@ def heights_at(
         raise InputError(f"unknown method {method!r}; choose one of {', '.join(get_args(Method))}")
     xy = np.asarray(xy, float)
     if xy.ndim != 2 or xy.shape[1] != 2 or not np.isfinite(xy).all():
-        raise InputError("invalid places; give an array of two columns, X_m and Y_m, without NaN")
+        raise InputError("invalid positions; give an array of two columns, X_m and Y_m, without NaN")
     grid = cloud if isinstance(cloud, Grid) else index_cloud(cloud)
     # Mean number of points within the range of horizontal errors; a multiple of `WIDE`.
     covered = np.count_nonzero(np.diff(grid.start)) * float(grid.cell_m) ** 2

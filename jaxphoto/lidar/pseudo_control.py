@@ -170,7 +170,7 @@ def _pseudo_control(
             seen, near_step = levels(cloud[index, :2] - ray.at(z), z, there, ray.run, points, settings.sigma_z_m)
             near = seen & (jnp.cumsum(seen) <= points)
             mean = jnp.sum(jnp.where(near, z, 0)) / jnp.maximum(near.sum(), 1)
-            # Keep `broken` of earlier iterations: the image may show a step that the ray passes.
+            # Keep `broken` of earlier iterations: the image may show a height discontinuity that the ray passes.
             return jnp.where(near.any(), ray.at(mean), place), (index, seen, near_step | broken)
 
         some = around(grid, place, reach)[0][: _CANDIDATES * points]
@@ -279,7 +279,7 @@ def pseudo_control_of_block(
     chosen = np.isin(rows.point, points) if points is not None else np.ones(len(rows.point), bool)
     measured = np.flatnonzero(chosen)
     if not len(measured):
-        raise BlockError("none of the points for pseudo control is measured in an image; name others")
+        raise BlockError("none of the points for pseudo control is measured in an image; choose others")
     image, point, xy = rows.image[measured], rows.point[measured], to_numpy(rows.xy)[measured]
     exterior = jax.tree.map(lambda v: to_numpy(v)[image], unknowns.exterior)
     camera = np.array(block.image_camera, object)[image]

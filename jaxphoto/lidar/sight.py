@@ -93,11 +93,11 @@ def levels(
 ) -> tuple[Bool[Array, "m"], Bool[Array, ""]]:
     """Select the laser points nearest to a ray, at heights `z` (m), that the image shows; nearest first.
 
-    The second value is True if the feature is so close to a step that its level is ambiguous.
+    The second value is True if the feature is so close to a height discontinuity that its level is ambiguous.
 
     The heights are divided at their largest gap, if noise and slope cannot explain it. The upper level hides the lower
-    one wherever it surrounds the feature. The feature is at the step between both if neither surrounds it, or if the
-    ray is so steep (`run` is d(X, Y)/dZ) that the lower level does not appear *behind* the upper one.
+    one wherever it surrounds the feature. The feature is at the discontinuity between both if neither surrounds it, or
+    if the ray is so steep (`run` is d(X, Y)/dZ) that the lower level does not appear *behind* the upper one.
     """
     # Gap from each point to the next higher one. Comparing all pairs (few) compiles faster than a sort.
     higher = jnp.min(jnp.where(there & (z > z[:, None]), z, jnp.inf), axis=1)

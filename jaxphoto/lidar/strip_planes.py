@@ -53,7 +53,7 @@ class StripSettings:
                 raise InputError(f"{name} is {value:g}: give a positive number")
         if self.returns < 4 or self.most < 1:
             raise InputError(
-                f"a plane needs 4 returns and an adjustment 1 plane, got returns {self.returns} and most {self.most}"
+                f"returns must be at least 4 and most at least 1, got returns = {self.returns} and most = {self.most}"
             )
 
     @property
@@ -227,7 +227,7 @@ def planes_of(
     )
     normal = axes[:, :, 0] * np.where(axes[:, 2, 0] < 0, -1.0, 1.0)[:, None]
     along = axes[usable][:, :, 1:]
-    # A roughness below every scanner's noise is accidental: limit it.
+    # A roughness below the noise of any scanner is due to chance: limit it.
     variance = np.maximum(roughness[usable], settings.least_roughness_m) ** 2
     # Horizontal errors make steep planes rougher: moderate variances by planes of similar slope.
     above = steep(normal[usable])

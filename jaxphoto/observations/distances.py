@@ -36,4 +36,4 @@ class Distances(AbstractObservations):
         for row in np.flatnonzero(self.points[:, 0] == self.points[:, 1]):
             yield int(row), "the distance runs from a point to itself; correct point_a or point_b"
         for row in np.flatnonzero(np.asarray(self.value) <= 0):
-            yield int(row), f"distance_m is {self.value[row]:g}; a distance is positive, so give its true value"
+            yield int(row), f"distance_m is {self.value[row]:g}; a distance is positive; correct it"

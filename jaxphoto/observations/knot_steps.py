@@ -40,7 +40,7 @@ class AbstractKnotSteps(AbstractObservations):
         for row in np.flatnonzero((kept < 0) | (kept > 1)):
             yield (
                 int(row),
-                f"kept is {kept[row]:g}; give the part of an error that is left at the next knot, 0 to 1",
+                f"kept is {kept[row]:g}; give the fraction of an error that remains at the next knot, 0 to 1",
             )
 
     def words(self, images, points) -> np.ndarray:

@@ -171,7 +171,7 @@ def _shifts(adjusted: Adjustment, cov: Covariance, parameters: _SharedParameters
     clear = sorted((r for r in rows if r[1] > SIGNIFICANT), reverse=True) or [max(rows, key=lambda r: r[1])]
     listed = "; ".join(r[2] for r in clear[:_SHOWN]) + (f" and {len(clear) - _SHOWN} more" if clear[_SHOWN:] else "")
     major = bool(clear[0][0] > MAJOR)
-    judged = "major shift or drift" if major else "significant shift or drift, not major, which the next steps keep"
+    judged = "major shift or drift" if major else "significant shift or drift, not major, which the next steps retain"
     return [f"{judged}: {listed}", *note], keep, major
 
 
@@ -295,9 +295,9 @@ def _differences(
         )
     bent = worst[0] > SIGNIFICANT
     judged = (
-        "a systematic tendency from the control: check its coordinates and its datum against that of the stations"
+        "a systematic effect of the control: check its coordinates and its datum against that of the stations"
         if bent
-        else "no systematic tendency from the control"
+        else "no systematic effect of the control"
     )
     return estimates, f"step 4 minus step 3 is at most {worst[0]:.1f} of its sigmas, {worst[1]}: {judged}", bent
 

@@ -1,7 +1,7 @@
 """Compare calibrations: two adjustments, or random halves of a block.
 
 `compare` tests for a camera change between two adjustments. `halves` tests if two calibrations agree within
-their covariances. The block is repeatedly divided in two; units (images, strips, flights) are not divided. Both
+their covariances. The block is repeatedly split in two; units (images, strips, flights) are not split. Both
 halves are adjusted, and their bundles of rays compared over the format (`stability`). Differences in excess of the
 covariances are due to model error (`stability.band`).
 
@@ -117,9 +117,9 @@ class Halves(NamedTuple):
     promised_px: Float[np.ndarray, "cells"]
     """RMS length (both axes) of the error according to the covariance of the whole block."""
     cuts: tuple[Cut, ...]
-    """Divisions that were compared."""
+    """Splits that were compared."""
     failed: tuple[Cut, ...]
-    """Divisions that could not be compared."""
+    """Splits that could not be compared."""
     band: ErrorBand
 
     @property
@@ -159,11 +159,11 @@ def halves(
 ) -> Halves:
     """Adjust `block` and random halves of it, and compare `camera` at `cells_mm` (`image_grid`).
 
-    `by` is the unit that is never divided: "image", "strip", or a partition of the block such as "day". `n_cuts`
-    divisions are drawn with `seed`, or all if fewer exist. `method` defines which systematic effects the orientation of
-    the images absorbs (`stability.alignment`).
+    `by` is the unit that is never split: "image", "strip", or a partition of the block such as "day". `n_cuts` splits
+    are drawn with `seed`, or all if fewer exist. `method` defines which systematic effects the orientation of the
+    images absorbs (`stability.alignment`).
 
-    Raises InputError if the block cannot be divided, no parameter of the camera is estimated or no two halves can be
+    Raises InputError if the block cannot be split, no parameter of the camera is estimated or no two halves can be
     compared, and the errors of `adjust` for the whole block.
     """
     name = camera_of(block, camera)
@@ -180,7 +180,7 @@ def halves(
     check_rays(interior, cells_mm, f"camera {name}")
     done = []
     for k, units in enumerate(first):
-        report(f"adjusting halves: cut {k + 1} of {len(first)}")
+        report(f"adjusting halves: split {k + 1} of {len(first)}")
         done.append(halved(adjusted, units[_units(block, by)[1]], name, cells_mm, method, sizes))
     good = [k for k, cut in enumerate(done) if not cut.problem]
     if not good:
@@ -207,9 +207,9 @@ def camera_of(block: Block, camera: str | None) -> str:
     """Return the camera to compare. Raises InputError if it does not exist or is ambiguous."""
     names = ", ".join(block.sensors)
     if camera is None and len(block.sensors) > 1:
-        raise InputError(f"the block has {len(block.sensors)} cameras; name one of {names}")
+        raise InputError(f"the block has {len(block.sensors)} cameras; choose one of {names}")
     if camera is not None and camera not in block.sensors:
-        raise InputError(f"unknown camera {camera}; name one of {names}")
+        raise InputError(f"unknown camera {camera}; choose one of {names}")
     return camera if camera is not None else names
 
 
@@ -217,15 +217,15 @@ def _units(block: Block, by: str) -> tuple[list[str], np.ndarray]:
     """Return the names of the units, and the unit of each image."""
     owners = block.owners(by)
     if "" in owners:
-        raise InputError(f"image {block.images[owners.index('')]} has no {by}; add it, or divide by image")
+        raise InputError(f"image {block.images[owners.index('')]} has no {by}; add it, or split by image")
     names = list(dict.fromkeys(owners))
     return names, np.array([names.index(owner) for owner in owners])
 
 
 def _cuts(block: Block, by: str, camera: str, n: int, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Return the number of image points of each unit, and the units in the first half of each division (cuts, units).
+    """Return the number of image points of each unit, and the units in the first half of each split (cuts, units).
 
-    Both halves of every division contain the camera.
+    Both halves of every split contain the camera.
     """
     names, unit = _units(block, by)
     has_camera = np.array([c == camera for c in block.image_camera])
@@ -236,7 +236,7 @@ def _cuts(block: Block, by: str, camera: str, n: int, seed: int) -> tuple[np.nda
     for _ in range(_TRIES):
         more = _balanced(len(names), rng)
         more = more[more[:, shows].any(axis=1) & ~more[:, shows].all(axis=1)]
-        # Exchanging the halves gives the same division.
+        # Exchanging the halves gives the same split.
         both = np.concatenate([divisions, more])
         _, at = np.unique(both ^ ~both[:, :1], axis=0, return_index=True)
         divisions = both[np.sort(at)]
@@ -246,11 +246,11 @@ def _cuts(block: Block, by: str, camera: str, n: int, seed: int) -> tuple[np.nda
 
 
 def _balanced(units: int, rng: np.random.Generator) -> Bool[np.ndarray, "cuts units"]:
-    """Draw balanced divisions: any two units are together in half of them.
+    """Draw balanced splits: any two units are in the same half in half of the splits.
 
-    Jointly they estimate the scatter of halves to first order as all divisions would. The rows are taken from a
-    Hadamard matrix with random columns and signs, except rows with less than a third of the units in one half. Source:
-    McCarthy (1969), balanced half-samples.
+    Together they estimate the scatter of the halves, to first order, as well as all splits would. The rows are taken
+    from a Hadamard matrix with random columns and signs, except rows with less than a third of the units in one half.
+    Source: McCarthy (1969), balanced half-samples.
     """
     order = 1 << (units - 1).bit_length()
     rows = scipy.linalg.hadamard(order)[rng.permutation(order)]

@@ -28,7 +28,8 @@ from jaxphoto.procedures.orientation.orient_photographs import CAMERA, Report
 from jaxphoto.procedures.rolling_shutter import NEIGHBOUR_M, Moment, with_rolling_shutter
 from jaxphoto.statistics import Selection, VarianceComponents, variance_components
 
-# Number of random vectors of the trace estimate. Each is expensive with 1e5 image points; variance components are few.
+# Number of random vectors of the trace estimate. Each is expensive with 1e5 image points, and a few suffice for few
+# variance components.
 _PROBES = 16
 # Minimum number of unoriented photographs that form a separate part; two would have no redundancy.
 _PART_OF_ITS_OWN = 3
@@ -203,7 +204,8 @@ def _calibrated(
     metric = bool(controlled or (placed and not why_not))
     adjusted, why_no_shutter = _rolling(adjusted, prior.taken, metric)
     components = None
-    # Estimate components also for prior information about the lens, which needs the weight of image points.
+    # Estimate components also with prior information about the lens, which requires realistic weights of the image
+    # points.
     if (placed or controlled or lens) and bool(adjusted.converged):
         report("estimating variance components")
         marked = {controlled.ids[p] for p in controlled.marks.point} if controlled else ()

@@ -4,8 +4,8 @@
     found = georeference(read_block("block"))
     found.exterior_sigma, found.point_sigma, found.discrepancies.value
 
-Exterior orientation is not adjusted, and control serves as check points. The points are identical to an adjustment of
-`variants.direct` without control.
+Exterior orientation is not adjusted, and control serves as check points. The points are identical to those of an
+adjustment of `variants.direct` without control.
 """
 
 from functools import partial
@@ -39,7 +39,8 @@ from jaxphoto.short_repr import pretty_repr
 from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Weighted
 
-# Number of Gauss-Newton steps after the intersection: the first leaves micrometres, the second rounding errors.
+# Number of Gauss-Newton steps after the intersection: the first leaves errors of micrometres, the second only rounding
+# errors.
 _STEPS = 4
 
 

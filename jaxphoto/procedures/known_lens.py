@@ -40,13 +40,13 @@ class KnownLens(NamedTuple):
 
 
 def has_prior(block: Block, camera: str) -> bool:
-    """Return True if an earlier calibration observes parameters of the camera."""
+    """Return True if the camera has prior information from an earlier calibration."""
     labels = (label for rows in block.more if isinstance(rows, KnownParameters) for label in rows.labels)
     return any(label.startswith(f"interior[{camera}].") for label in labels)
 
 
 def with_known_lens(block: Block, camera: str, lens: KnownLens) -> Block:
-    """Observe all free parameters of the camera with the prior information about its lens.
+    """Weight all free parameters of the camera by the prior information about its lens.
 
     Fixed parameters, and cameras with an earlier calibration, are unchanged.
     """

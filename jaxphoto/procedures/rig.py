@@ -38,7 +38,7 @@ def with_rig(block: Block, reference: str, place_m: float, turn_rad: float) -> B
     cameras, events = np.array(block.image_camera), np.array(block.partitions[EVENT])
     references = np.flatnonzero((cameras == reference) & (events != ""))
     if not len(references):
-        raise InputError(f"no image of camera {reference} is in an event; name another reference camera")
+        raise InputError(f"no image of camera {reference} is in an event; choose another reference camera")
     first = {event: int(i) for i, event in zip(references[::-1], events[references[::-1]], strict=True)}
     image = np.array([i for i, event in enumerate(events) if cameras[i] != reference and event in first], int)
     if not len(image):

@@ -128,7 +128,7 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
     if part.controlled:
         yield from control_findings(part.controlled)
     if part.why_not and not part.controlled:
-        frame = "is placed by its positions, but not constrained by them" if part.placed else "has an arbitrary frame"
+        frame = "is placed by its positions, which are not observations" if part.placed else "has an arbitrary frame"
         yield Finding("own_frame", "warning", part.why_not, numbers={"frame": frame})
     if part.placed and not part.placed.used.all():
         used = part.placed.used
@@ -279,7 +279,7 @@ def positions_section(report: PartReport, source: FlightSource) -> Iterator[Part
         yield Paragraph(f"No recorded position is used: {part.why_not or 'none was read'}.")
         return
     if part.why_not:
-        yield Paragraph(f"They place the block, but are not observed: {part.why_not}.")
+        yield Paragraph(f"They define the frame of the block, but are not observations: {part.why_not}.")
     n = table["position"].value_counts()
     yield Paragraph(
         f"Recorded minus adjusted, X east, Y north, Z up. Used: {n.get('used', 0)}; rejected: {n.get('left out', 0)}; "

@@ -37,8 +37,8 @@ _STRETCHED = 0.01
 # Ratio of a systematic effect to the sigma of its observations, and shift of an interior parameter (sigma), above which
 # the effect is a warning; shift above which it is an error.
 _VISIBLE, _MOVED, _SPOILT_BY_EFFECT = 0.25, 1.0, 10.0
-# Exponent of the p-values of common station biases, which a changed camera imitates. If p-values are similar
-# (logarithms within a tenth), the camera's prior is reported first, because it is older.
+# Exponent of the p-values of common station biases. A changed camera has a similar effect: if p-values are similar
+# (logarithms within a tenth), the prior of the camera is reported first, because it is older.
 _SIMILAR = 1.1
 # Ratio of MDB to sigma above which an observation is hardly checked (r < 0.17).
 _HIDDEN = 10.0
@@ -49,8 +49,8 @@ def residual_findings(tables: Tables) -> Iterator[Finding]:
     yield from _global_test(tables)
     fits = statistics.global_test(tables.adjusted, tables.redundancy).sigma <= ABSURD
     effects, suspects = list(_systematic(tables, fits)), tables.blunders.suspects
-    # Report effects that are more certain than the worst suspect first: they imitate blunders in many observations. If
-    # sigma naught is absurd, first-order theory cannot separate the two.
+    # First report effects with smaller p-values than the largest suspect: they appear as blunders in many observations.
+    # If sigma naught is far too large, first-order theory cannot separate the two.
     worst_w = max((abs(s.w) for s in suspects), default=0.0)
     by_chance = tables.blunders.n * float(scipy.special.erfc(worst_w / np.sqrt(2)))
     first = [e for e in effects if e.chance < by_chance] if suspects and fits else []
@@ -189,8 +189,8 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
         if t.size > 0 and unit:
             detail = f", size {factor * t.size:.2g} {unit} ({t.size / t.sigma:.2g} sigma)"
         together = t.significant_terms
-        # Test both the size and the estimated terms: estimated parameters absorb part of an effect, which may hide its
-        # size in the noise.
+        # Test both the size and the estimated terms: estimated parameters absorb part of an effect, whose size may then
+        # be below the noise.
         matters = t.size > _VISIBLE * t.sigma or any(abs(h.amount) > _VISIBLE * t.sigma for h in together)
         if together or (t.hints and t.hints[0].share > MOST_OF_IT):
             likely = together or [t.hints[0]]

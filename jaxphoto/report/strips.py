@@ -383,8 +383,9 @@ def _sections(
     else:
         yield Heading("Errors of the trajectory")
         yield Paragraph(
-            "Trajectory errors along each strip with bands of two standard deviations. Most of these is a common shift "
-            "or rotation of all strips, which overlaps do not determine; between strips far less is undetermined."
+            "Trajectory errors along each strip with bands of two standard deviations. Most of this uncertainty is a "
+            "common shift or rotation of all strips, which overlaps do not determine; differences between strips are "
+            "determined far better."
         )
         yield [
             Plot(

@@ -110,7 +110,7 @@ def _not_converged(adjusted: Adjustment) -> Iterator[Finding]:
 
 
 def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
-    """Yield images that look away from their points, and single points behind images."""
+    """Yield images that face away from their points, and single points behind images."""
     block = adjusted.block
     rows, seen = block.image_points, in_front(block, adjusted.unknowns)
     away = looking_away(block, seen)
@@ -175,7 +175,7 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
 def at_corner(tables: Tables, camera: str) -> dict[str, float]:
     """Return the shift of the image corner by one sigma of each estimated parameter, in sigmas of an image point.
 
-    c acts along the radius, the principal point directly; coefficients are in yardsticks (`adjustment.yardsticks`).
+    c acts along the radius, the principal point directly; coefficients are scaled (`adjustment.yardsticks`).
     """
     adjusted = tables.adjusted
     sensor, rows = adjusted.block.sensors[camera], adjusted.block.image_points
@@ -223,7 +223,7 @@ def _strongest(c: Correlations, rows: slice, parameters: tuple[str, ...]) -> flo
 
 
 def _weak(tables: Tables, reported: frozenset[str]) -> Iterator[Finding]:
-    """Report unknowns with a sigma above `POOR` yardsticks, except the interior orientations in `reported`."""
+    """Report unknowns with a scaled sigma above `POOR`, except the interior orientations in `reported`."""
     adjusted, q = tables.adjusted, tables.covariance
     yard, a_priori = yardsticks(adjusted), 1 / np.sqrt(float(q.variance_factor))
     in_yardsticks = (
@@ -339,7 +339,7 @@ def lens_findings(tables: Tables) -> Iterator[Finding]:
 
 
 def readout_of(camera: str) -> str:
-    """Return the path of a camera's rolling-shutter readout."""
+    """Return the parameter path of a camera's rolling-shutter readout."""
     return f"{RollingShutter.kind}[{camera}].readout_ms"
 
 

@@ -134,7 +134,7 @@ def _inverse(m: Float[np.ndarray, "n n"], positive: bool) -> Float[np.ndarray, "
 
 
 def _inverses(l: Float[np.ndarray, "n 6"]) -> Float[np.ndarray, "n 3 3"]:  # noqa: E741
-    """Return V^-1 of V = L L'."""
+    """Return V^-1 from the Cholesky factor L of V."""
     lower = np.zeros((len(l), 3, 3))
     lower[:, [0, 1, 1, 2, 2, 2], [0, 0, 1, 0, 1, 2]] = l
     inverse = np.linalg.inv(lower)

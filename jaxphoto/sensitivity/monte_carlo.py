@@ -90,7 +90,7 @@ def readjust(
     exterior: bool = False,
     points: bool = False,
 ) -> Draws:
-    """Re-adjust the block of `adjusted` for each of `entries`, a tree of arrays along their first axis.
+    """Re-adjust the block of `adjusted` for each entry along the first axis of `entries`, a tree of arrays.
 
     `change(entry, block)` returns the block with other values, in the same form as `perturb` of `monte_carlo`.
     """

@@ -303,8 +303,8 @@ def _check(designs: Sequence[Design], rotations: Rotations) -> None:
         n = len(design.block.points)
         if design.truth is not None and len(design.truth.points) != n:
             raise InputError(
-                f"{_name(k, design)} has a truth of {len(design.truth.points)} points, but its block has {n}: give the "
-                "truth of the same points, in the order of the block"
+                f"{_name(k, design)} has true coordinates of {len(design.truth.points)} points, but its block has {n}: "
+                "give those of the same points, in the order of the block"
             )
 
 

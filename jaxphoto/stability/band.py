@@ -98,7 +98,7 @@ def error_band(differences: Differences, covariance: Float[np.ndarray, "cells 2 
 
 
 def _scale(relative: Float[np.ndarray, "cuts cells"]) -> float:
-    """Return the LEVEL quantile of squared differences divided by the squared radius from the other splits."""
+    """Return the LEVEL quantile of `relative`, squared differences over squared radii from the other splits."""
     return float(np.quantile(relative, LEVEL)) if len(relative) >= _MIN_SPLITS else 1.0
 
 
@@ -118,7 +118,8 @@ def leading_unit(
 ) -> tuple[int, float]:
     """Return the unit that explains the largest fraction of the squared differences, and this fraction.
 
-    Model: d_k = s_ku z_u + remainder. Each of many equal units explains about its share, plus 1 / cuts by chance.
+    Model: d_k = s_ku z_u + remainder. Each of many equal units explains about an equal fraction, plus 1 / (number of
+    splits) by chance.
     """
     side = np.where(first, 1.0, -1.0)
     mean = np.einsum("ku,kcx->ucx", side, offsets) / len(side)

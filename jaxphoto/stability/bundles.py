@@ -8,8 +8,9 @@ of the first bundle are
     spr    v = -c1 q_xy / q_z - x2 c1 / c2,   q = R (P - X0)                second bundle resected, v'v minimal
 
 where P = d (x1, -c1) / c1 are object points on the first bundle's rays, at depths d. Bundles that differ only by the
-alignment are equivalent in use. The alignment is none if position and attitude are observed and the camera is fixed to
-these sensors (zrot), the attitude if only positions are observed (rot), and both in indirect georeferencing (spr).
+alignment are equivalent in application. No alignment is applied if position and attitude are observed and the camera is
+fixed to these sensors (zrot), a rotation if only positions are observed (rot), and both in indirect georeferencing
+(spr).
 Source: Habib, Pullivelli, Mitishita, Ghanma and Kim, Photogrammetric Record 21 (2006), 29-43.
 """
 

@@ -58,11 +58,11 @@ _MAX_MISFIT = 0.02
 # the small remainder is significant.
 _MIN_FRACTION_OF_SHIFT = 1e-6
 _CURE_OF_SHIFT = {
-    "m": "on the average: another datum or kind of height, or a wrong lever arm; compare with control, or "
+    "m": "on average: another datum or height reference, or a wrong lever arm; compare with control, or "
     'estimate a shift of the flight ([unknowns.flight_bias], shift = "free")',
-    "rad": "on the average: another convention of angles, or a boresight: set it free",
+    "rad": "on average: another angle convention, or a boresight: set it free",
 }
-_CURE_OF_STRIP = "on the average: estimate a shift of that strip, or check its recording and its camera"
+_CURE_OF_STRIP = "on average: estimate a shift of that strip, or check its recording and its camera"
 
 
 @pretty_repr

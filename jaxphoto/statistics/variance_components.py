@@ -263,7 +263,7 @@ def _products(adjusted: Adjustment, parts: Parts, probes: int) -> tuple[np.ndarr
     at = [np.flatnonzero(part == k) for k in range(n)]
     weight = np.array([np.inf if len(places) <= probes else 1.0 for places in at])
     weight[largest] = 0.0
-    # Index of each unit vector of a part; -1 for random signs.
+    # Observation index of each unit vector of a part; -1 for vectors of random signs.
     units = [places if w == np.inf else np.full((w > 0) * probes, -1) for places, w in zip(at, weight, strict=True)]
     part_of_unit, unit = np.repeat(np.arange(n), [len(u) for u in units]), np.concatenate(units)
 

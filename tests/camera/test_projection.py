@@ -240,7 +240,7 @@ def test_other_fisheyes_convert_to_the_polynomial_of_opencv(name):
 
 
 def test_what_a_plane_cannot_show_is_not_converted_to_it():
-    with pytest.raises(ValueError, match="sees directions within its format that the projection perspective does not"):
+    with pytest.raises(ValueError, match="the projection perspective does not cover all directions in the format"):
         converted(fisheye(), OpenCvFisheye, WIDE, (), Perspective())
 
 

@@ -64,7 +64,7 @@ def test_comparison_figure_draws_ours_and_the_print():
     np.testing.assert_allclose(ours.get_xdata(orig=False), [4.1e-7, 3.8e-7])
     assert [label.get_text() for label in c.get_yticklabels()] == ["first", "third", "all"]
     figure.draw_without_rendering()
-    with pytest.raises(ValueError, match="no printed value has a result of ours"):
+    with pytest.raises(ValueError, match="no cell is both printed and computed"):
         comparison_figure(COMPARISON, "own")
 
 
@@ -75,7 +75,7 @@ def test_plots_take_and_return_axes():
     within, beyond = axes.lines
     np.testing.assert_allclose(np.sort(within.get_xdata()), [0.5, 2 / 3])
     np.testing.assert_allclose(beyond.get_xdata(), [1.75])
-    with pytest.raises(ValueError, match="no printed value with a result of ours has a tolerance"):
+    with pytest.raises(ValueError, match="no cell that is both printed and computed has a tolerance"):
         plot_agreement(COMPARISON[COMPARISON["table"] == "own"], axes)
     one = plot_comparison(COMPARISON, "table2_iops", "sigma_k1_mm-2", Figure().add_subplot())
     _, ours = [container.lines[0] for container in one.containers]

@@ -48,7 +48,7 @@ def test_the_geoid_is_added_to_what_is_not_above_the_ellipsoid(geoid):
         f"the heights of 2 photographs are interpreted as EPSG:5773; its geoid, {UNDULATION_M:+.2f} to "
         f"{UNDULATION_M:+.2f} m, is added"
     ]
-    assert "the files give all above the ellipsoid" in one_height({"c": given["c"]}, {}, EGM96)[1][1]
+    assert "all heights in the files are ellipsoidal" in one_height({"c": given["c"]}, {}, EGM96)[1][1]
 
 
 def test_a_block_has_heights_above_the_geoid_in_its_files(geoid):

@@ -34,8 +34,8 @@ CASES = {
     "bad number of an unseen point": (
         [(O, "p2,2.5", "p9,x")], ["object_points.csv, row 3", "'x'", "write it like"],
     ),
-    "negative sigma": ([(P, "0.003,0.002", "-0.003,0.002")], ["image_points.csv, row 3", "sigma_x_mm", "true value"]),
-    "zero sigma": ([(C, "0.01,0.01,0.02", "0.01,0.0,0.02")], ["control_points.csv, row 2", "sigma_Y_m", "true value"]),
+    "negative sigma": ([(P, "0.003,0.002", "-0.003,0.002")], ["image_points.csv, row 3", "sigma_x_mm", "is positive"]),
+    "zero sigma": ([(C, "0.01,0.01,0.02", "0.01,0.0,0.02")], ["control_points.csv, row 2", "sigma_Y_m", "is positive"]),
     "zero station sigma": ([(S, "0.05,0.05,0.1", "0.05,0.05,0")], ["stations.csv, row 2", "sigma_Z_m", "positive"]),
     "zero attitude sigma": ([(A, "0.005,0.005", "0,0.005")], ["attitudes.csv, row 2", "sigma_roll_deg", "positive"]),
     "zero distance sigma": ([(D, "1.5,0.001", "1.5,0")], ["distances.csv, row 2", "sigma_m", "positive"]),
@@ -94,7 +94,7 @@ CASES = {
     "angle in gon": ([(I, "-0.25,90.0", "-0.25,399.0")], ["images.csv, row 2", "kappa_deg = 399", "degrees"]),
     "attitude in gon": ([(A, "45.0", "390.0")], ["attitudes.csv, row 2", "yaw_deg = 390", "degrees"]),
     "distance to itself": ([(D, "p2,p3", "p2,p2")], ["distances.csv, row 3", "correct"]),
-    "negative distance": ([(D, "p2,p3,2.5", "p2,p3,-2.5")], ["distances.csv, row 3", "-2.5", "true value"]),
+    "negative distance": ([(D, "p2,p3,2.5", "p2,p3,-2.5")], ["distances.csv, row 3", "-2.5", "a distance is positive"]),
     "lever arm in mm": ([(T, "[0.1, 0.2, -0.3]", "[100.5, 200, 300]")], ["block.toml", "lever_arm_m", "metres"]),
     "both kinds of sigma": (
         [(P, "sigma_x_mm,sigma_y_mm", "sigma_x_mm,sigma_px")], ["image_points.csv, row 3", "sigma_px", "keep one"],
@@ -106,7 +106,7 @@ CASES = {
     "number as text": ([(T, "c_mm = 5.0", 'c_mm = "5.0"')], ["block.toml", "c_mm", "quotation marks"]),
     "number as truth": ([(T, "c_mm = 5.0", "c_mm = true")], ["block.toml", "c_mm", "write it like"]),
     "TOML nan": ([(T, "k1 = -1e-4", "k1 = nan")], ["block.toml", "k1", "finite"]),
-    "default sigma": ([(T, "image_mm = 0.004", "image_mm = 0")], ["block.toml", "[sigmas] image_mm", "true value"]),
+    "default sigma": ([(T, "image_mm = 0.004", "image_mm = 0")], ["block.toml", "[sigmas] image_mm", "correct it"]),
     "part of a pixel": ([(T, "width_px = 400", "width_px = 400.5")], ["block.toml", "width_px", "whole number"]),
     "no c": ([(T, "c_mm = 5.0\n", "")], ["block.toml", "[cameras.kodak.interior] c_mm", "add it"]),
     "no format": ([(T, "width_px = 400\n", "")], ["block.toml", "[cameras.kodak] width_px", "add it"]),

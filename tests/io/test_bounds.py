@@ -23,7 +23,7 @@ def test_text_of_any_line_ends(tmp_path):
     path.write_bytes(b"a\nb\n\xff\n")
     with pytest.raises(InputError, match="a, row 3: the text is not UTF-8"):
         read_text(path)
-    for place, words in ((tmp_path, "is a folder"), (tmp_path / "none", "no file"), (path / "below", "no file")):
+    for place, words in ((tmp_path, "is a folder"), (tmp_path / "none", "not found"), (path / "below", "not found")):
         with pytest.raises(InputError, match=words):
             read_bytes(place)
 

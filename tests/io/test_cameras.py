@@ -380,7 +380,7 @@ def test_bad_files_are_refused_in_one_sentence(tmp_path, text, name, message):
 
 
 def test_wrong_use_is_refused(tmp_path):
-    with pytest.raises(InputError, match="there is no file"):
+    with pytest.raises(InputError, match="file not found"):
         read_camera_file(tmp_path / "none.yml")
     with pytest.raises(InputError, match=r"contains none of interior.csv, block.toml, camera.toml, cameras.txt"):
         read_camera_file(tmp_path)

@@ -339,7 +339,7 @@ def test_files_that_are_cut_off(tmp_path, kind):
 
 
 def test_invalid_files_are_refused(tmp_path):
-    assert "no file" in complaint(tmp_path / "none.las")
+    assert "file not found" in complaint(tmp_path / "none.las")
     (tmp_path / "c.xyz").write_text("1 2 3\n")
     assert ".laz" in complaint(tmp_path / "c.xyz")
     (tmp_path / "c.las").write_text("no cloud at all " * 50)

@@ -281,7 +281,7 @@ def test_models_that_cannot_be_written(tmp_path):
     (tmp_path / "other" / "thesis.txt").write_text("years of work")
     with pytest.raises(InputError, match="was not written by jaxphoto"):
         write_colmap_model(block, tmp_path / "other")
-    with pytest.raises(InputError, match="is a file: name a folder"):
+    with pytest.raises(InputError, match="is a file: give a folder"):
         write_colmap_model(block, tmp_path / "other" / "thesis.txt")
     terms = lambda b: (b.start.unknowns.interior["5"].distortion.k1, b.start.unknowns.interior["5"].distortion.b2)  # noqa: E731
     folding = eqx.tree_at(terms, block, (np.array(-9.0), np.array(0.1)))

@@ -271,9 +271,7 @@ def test_a_comma_in_an_id_is_no_decimal_comma(write_folder):
 
 def test_tables_without_a_class_are_refused(block, tmp_path):
     write_block(dataclasses.replace(block, more=(rows_of(HeightDifferences, 2),)), tmp_path / "copy")
-    with pytest.raises(
-        InputError, match=r"observations: jaxphoto has no class for height_differences\.csv; give yours"
-    ):
+    with pytest.raises(InputError, match=r"observations: no class is known for height_differences\.csv; pass it"):
         read_block(tmp_path / "copy")
     write_block(block, tmp_path / "copy")
     assert not (tmp_path / "copy" / "height_differences.csv").exists()
@@ -283,7 +281,7 @@ def test_tables_without_a_class_are_refused(block, tmp_path):
 def test_observations_that_files_cannot_hold_are_refused(block, tmp_path):
     second = rows_of(CameraPositions, 2)
     with pytest.raises(
-        BlockError, match=r"Block\.more has stations, but stations\.csv is for those of Block\.stations"
+        BlockError, match=r"Block\.more contains stations, but stations\.csv is reserved for Block\.stations"
     ):
         write_block(dataclasses.replace(block, more=(second,)), tmp_path / "copy")
     tilted = dataclasses.replace(rows_of(Everything, 1), offset=np.ones(1))

@@ -222,7 +222,7 @@ model = "ciddor"
 @pytest.mark.parametrize(
     ("changes", "words"),
     [
-        ([section("[unknowns.tides]")], r"\[unknowns\] tides: jaxphoto has no class for these unknowns; give yours"),
+        ([section("[unknowns.tides]")], r"\[unknowns\] tides: no class is known for these unknowns; pass it"),
         (
             [section("[unknowns.camera_rates.leica]")],
             r"\[unknowns\.camera_rates\] leica: unknown key; use default, kodak",

@@ -93,7 +93,7 @@ def test_a_camera_file_keeps_the_covariance(years, results, monkeypatch, capsys)
     ("table", "sentence"),
     [
         ('calibration = "../this"', "has no covariance; give a result folder of jaxphoto adjust, or a camera file"),
-        ('calibration = "../nothing"', "there is no file"),
+        ('calibration = "../nothing"', "file not found"),
         (
             'calibration = "../results"\nwidth_px = 3',
             "width_px: already given by the calibration, which permits only residuals, unknowns",

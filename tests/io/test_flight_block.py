@@ -202,7 +202,7 @@ REFUSED = {
         lambda fly: _beside(fly(), "stations.csv", "image,X_m,Y_m,Z_m\na,1,2,3\n"),
         r"stations\.csv: .* flight\.csv; remove this file, or \[trajectory\]",
     ),
-    "no file": (lambda fly: _beside(fly(), "flight.csv", None), r"there is no file .*flight\.csv; add it"),
+    "no file": (lambda fly: _beside(fly(), "flight.csv", None), r"file not found: .*flight\.csv; add it"),
 }  # fmt: skip
 
 

@@ -127,7 +127,7 @@ def test_the_start_and_where_it_comes_from(tmp_path, taken, given, c_mm, pixel_m
 
 def test_files_that_are_no_photographs(tmp_path):
     good = write(tmp_path / "a.jpg")
-    with pytest.raises(InputError, match=r"none.jpg: there is no such photograph"):
+    with pytest.raises(InputError, match=r"none.jpg: photograph not found"):
         photographs([good, tmp_path / "none.jpg"])
     (tmp_path / "text.jpg").write_text("no picture")
     with pytest.raises(InputError, match=r"text.jpg: not a readable image"):
@@ -135,7 +135,7 @@ def test_files_that_are_no_photographs(tmp_path):
     (tmp_path / "empty.jpg").write_bytes(b"")
     with pytest.raises(InputError, match=r"empty.jpg: not a readable image"):
         photographs([tmp_path / "empty.jpg"])
-    with pytest.raises(InputError, match=r"is a folder; name its photographs"):
+    with pytest.raises(InputError, match=r"is a folder; give its photographs"):
         photographs([tmp_path])
     (tmp_path / "other").mkdir()
     twin = write(tmp_path / "other" / "a.png")

@@ -107,7 +107,7 @@ def test_bad_csv_is_refused(tmp_path, name):
 
 def test_bad_sbet_is_refused(tmp_path):
     path = tmp_path / "flight.sbet"
-    with pytest.raises(InputError, match=r"no file .*flight\.sbet; add it"):
+    with pytest.raises(InputError, match=r"file not found: .*flight\.sbet; add it"):
         read_sbet(path)
     path.write_bytes(b"0" * 300)
     with pytest.raises(InputError, match=r"300 bytes are not a whole number of SBET records of 136 bytes.*Export"):

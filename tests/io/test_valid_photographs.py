@@ -52,13 +52,13 @@ def test_of_several_copies_each_names_the_one_that_is_kept(folder):
 def test_folders_in_a_folder_and_raw_files_are_told(folder, tmp_path):
     card = tmp_path / "DCIM"
     (card / "100MEDIA").mkdir(parents=True)
-    with pytest.raises(InputError, match=r"no photograph that can be read$"):
+    with pytest.raises(InputError, match=r"none is a readable photograph$"):
         valid_photographs([card])
     (folder / "0.jpg").rename(card / "100MEDIA" / "0.jpg")
     with pytest.raises(InputError, match=r"100MEDIA: 1 picture in a folder that is not named"):
         valid_photographs([card])
     inner = card / "100MEDIA"
-    said = {str(inner): f"{inner}: 1 picture in a folder that is not named; name it, too"}
+    said = {str(inner): f"{inner}: 1 photograph in a subfolder that is not read; add this folder"}
     assert skipped_subfolders([card]) == said
     assert not skipped_subfolders([card, inner])
     (inner / ".jaxphoto.json").write_text("{}")
@@ -135,11 +135,11 @@ def test_a_second_body_of_the_same_model_and_a_digital_zoom_are_left_out(folder)
 
 
 def test_what_is_not_there_and_what_leaves_nothing_is_refused(folder, tmp_path):
-    with pytest.raises(InputError, match="there is no such photograph or folder"):
+    with pytest.raises(InputError, match="photograph or folder not found"):
         valid_photographs([folder / "absent"])
     empty = tmp_path / "empty"
     empty.mkdir()
-    with pytest.raises(InputError, match="there is no photograph that can be read"):
+    with pytest.raises(InputError, match="none is a readable photograph"):
         valid_photographs([empty])
 
 

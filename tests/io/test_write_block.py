@@ -150,7 +150,7 @@ def test_another_folder_is_left_alone(write_folder, tmp_path):
     with pytest.raises(InputError, match=r"photos is not empty and was not written by jaxphoto"):
         write_block(block, tmp_path / "photos")
     assert [path.name for path in (tmp_path / "photos").iterdir()] == ["1.jpg"]
-    with pytest.raises(InputError, match=r"1\.jpg is a file: name a folder"):
+    with pytest.raises(InputError, match=r"1\.jpg is a file: give a folder"):
         write_block(block, tmp_path / "photos" / "1.jpg")
 
 

@@ -68,7 +68,7 @@ def test_blunders_do_not_fit():
 def test_settings_that_cannot_be():
     with pytest.raises(InputError, match="cell_m is 0: give a positive number"):
         dataclasses.replace(SETTINGS, cell_m=0.0)
-    with pytest.raises(InputError, match="a plane needs 4 returns"):
+    with pytest.raises(InputError, match="returns must be at least 4"):
         dataclasses.replace(SETTINGS, returns=3)
 
 

@@ -63,7 +63,7 @@ def test_each_place_of_a_large_photograph_is_one_feature(tmp_path):
 
 
 def test_what_cannot_be_measured_is_told_in_a_sentence(tmp_path):
-    with pytest.raises(InputError, match="there is no such photograph"):
+    with pytest.raises(InputError, match="photograph not found"):
         sift_features(tmp_path / "none.tif", SENSOR)
     (tmp_path / "text.png").write_text("no picture")
     with pytest.raises(InputError, match="not a readable image"):

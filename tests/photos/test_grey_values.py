@@ -90,7 +90,7 @@ def test_a_small_file_that_says_it_is_large(tmp_path):
     path = tmp_path / "a.png"
     head = b"IHDR" + struct.pack(">II", 30_000, 30_000) + png()[24:29]
     path.write_bytes(png()[:12] + head + struct.pack(">I", zlib.crc32(head)) + png()[33:])
-    with pytest.raises(InputError, match=r"a\.png: OpenCV cannot read this picture"):
+    with pytest.raises(InputError, match=r"a\.png: OpenCV cannot read this image"):
         read_grey(path)
 
 
@@ -98,5 +98,5 @@ def test_lengths_within_a_file_that_are_longer_than_it(tmp_path):
     """OpenCV would take gigabytes for them."""
     path = tmp_path / "a.png"
     path.write_bytes(png()[:33] + b"\x7f" + png()[34:])
-    with pytest.raises(InputError, match=r"a\.png: OpenCV cannot read this picture"):
+    with pytest.raises(InputError, match=r"a\.png: OpenCV cannot read this image"):
         read_grey(path)

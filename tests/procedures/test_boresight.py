@@ -116,7 +116,7 @@ def test_without_and_with_control_differ_by_what_their_sigmas_allow():
         q = [(x[a][1] / float(s.adjusted.sigma0)) ** 2 for x, s in ((before, third), (after, fourth))]
         assert sigma == pytest.approx(float(fourth.adjusted.sigma0) * np.sqrt(q[1] - q[0]), rel=1e-6)
         assert abs(difference) < 3 * sigma
-    assert "no systematic tendency" in said(fourth)
+    assert "no systematic effect" in said(fourth)
 
 
 def test_control_in_another_datum_biases_the_misalignment():
@@ -128,7 +128,7 @@ def test_control_in_another_datum_biases_the_misalignment():
     made = eqx.tree_at(lambda b: b.control.value, made, np.asarray(control.value) + lean)
     found = boresight(made)
     assert [s.go_on for s in found] == [True, True, True, False]
-    assert "a systematic tendency from the control" in said(found[3])
+    assert "a systematic effect of the control" in said(found[3])
 
 
 def test_a_blunder_stops_at_the_first_step():
@@ -156,7 +156,7 @@ def test_a_moderate_shift_is_estimated():
     found = steps(shift)
     assert len(found) == 4
     assert found[1].biases == (("a", "shift"),)
-    assert "not major, which the next steps keep: shift of strip a in X +" in said(found[1])
+    assert "not major, which the next steps retain: shift of strip a in X +" in said(found[1])
     value, sigma = values(found[2])["strips[a].shift_X_m"]
     assert abs(value - shift) < 3 * sigma
     assert sigma < 0.2 * shift

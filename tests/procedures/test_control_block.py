@@ -49,7 +49,7 @@ def test_control_brings_the_block_to_its_place(marked):
     assert not [s for s in found.sentences if "rejected" in s]
     # Once more: it lies by control now, and not by any positions.
     again = control_block(at_optimum(found.adjusted), marked.control, adjust=adjust)
-    assert any("m (east, north, up) from where the block has it" in s for s in again.sentences)
+    assert any("offset of the control from the block" in s for s in again.sentences)
 
 
 @pytest.mark.slow

@@ -168,7 +168,7 @@ def test_the_command_writes_cells_and_cuts(field, tmp_path, monkeypatch, capsys)
 
 def test_impossible_splits_are_refused(field):
     block, _ = simulated("strips")
-    with pytest.raises(InputError, match="name one of one"):
+    with pytest.raises(InputError, match="choose one of one"):
         halves(block, CELLS, camera="two")
     one = dataclasses.replace(block, image_strip=("a",) * len(block.images))
     with pytest.raises(InputError, match="all images of camera one are in one strip"):

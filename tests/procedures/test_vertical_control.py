@@ -105,7 +105,7 @@ def test_a_triplet_is_calibrated_by_pseudo_control():
     ("change", "points", "error", "said"),
     [
         (lambda b: b, ("nobody",), InputError, "unknown point nobody"),
-        (lambda b: _with_height(b, 0), (0,), InputError, "is control already"),
+        (lambda b: _with_height(b, 0), (0,), InputError, "is already control"),
         (lambda b: _all_checked(b), None, BlockError, "no tie point"),
         (lambda b: dataclasses.replace(b, stations=CameraPositions.none()), None, DatumError, "camera stations"),
     ],

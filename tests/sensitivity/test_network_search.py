@@ -103,7 +103,7 @@ def test_what_cannot_be_searched_is_said_in_a_sentence():
     outside = stack_designs(dataclasses.replace(USUAL, height=np.full(4, 1300.0)))
     with pytest.raises(InputError, match="a start of height is outside its bounds"):
         optimise_design(sigma, PLAN, LOW, HIGH, outside)
-    with pytest.raises(InputError, match=r"the starts of heading have the shape \(4,\), but one has \(4,\)"):
+    with pytest.raises(InputError, match=r"the starts of heading have the shape \(4,\), but the variable has \(4,\)"):
         optimise_design(sigma, PLAN, LOW, HIGH, USUAL)
     with pytest.raises(InputError, match="the bounds of height are not all finite"):
         random_designs(LOW, dataclasses.replace(HIGH, height=np.full(4, np.inf)), 3)

@@ -273,7 +273,7 @@ def test_mistakes_are_told_in_one_sentence(designs, swept):
     blind = eqx.tree_at(lambda b: b.priors.mounts["default"].boresight, base.block, FREE)
     with pytest.raises(RankError, match=r"^design 1 .*boresight is free"):
         sweep([base._replace(block=blind)])
-    with pytest.raises(InputError, match=r"design 1 .* has a truth of 3 points, but its block has \d+"):
+    with pytest.raises(InputError, match=r"design 1 .* has true coordinates of 3 points, but its block has \d+"):
         sweep([base._replace(truth=eqx.tree_at(lambda t: t.points, base.truth, np.zeros((3, 3))))])
     with pytest.raises(ValueError, match="rotations must be one of"), unchecked():
         sweep([base], "euler")  # type: ignore[arg-type]

@@ -190,5 +190,5 @@ def test_two_cameras_at_two_heights():
 
 
 def test_a_missing_file_is_named(tmp_path):
-    with pytest.raises(InputError, match=r"there is no file .*nothing\.toml"):
+    with pytest.raises(InputError, match=r"file not found: .*nothing\.toml"):
         read_recipe(tmp_path / "nothing.toml")

@@ -35,12 +35,12 @@ class RayLists(eqx.Module):
     used: Int[np.ndarray, "devices 2"]
     """Number of batches, of rays and of pairs, that each device uses; the rest is padding."""
     met: Int[np.ndarray, "groups b"]
-    """Shared unknowns touched by rows at the points of each group; padded with the number of shared unknowns."""
+    """Shared unknowns involved in rows at the points of each group; padded with the number of shared unknowns."""
     free_points: bool = eqx.field(static=True)
     """True if any point has a free coordinate; otherwise nothing is eliminated."""
     by_image: bool = eqx.field(static=True)
     """True if camera unknowns are eliminated with the unknowns of their images, not as border unknowns that every point
-    may touch. Used if there are many more cameras than one image depends on.
+    may involve. Used if there are many more cameras than one image depends on.
     """
     columns: int = eqx.field(static=True)
     """Number of column blocks of the reduced matrix, K."""

@@ -32,7 +32,7 @@ def pad_groups(
 ) -> tuple[ObservedGroup, ...]:
     """Pad the groups of a structure to at least `rows` rows; `width` is the number of images of a column block.
 
-    `slots` contains, for groups stored by point, the slots of the shared unknowns that rows touch.
+    `slots` contains, for groups stored by point, the slots of the shared unknowns that rows involve.
     """
 
     def padded(g: ObservedGroup) -> ObservedGroup:

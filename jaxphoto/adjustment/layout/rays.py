@@ -29,7 +29,7 @@ class PaddedSizes(NamedTuple):
     """Number of chunks of rays."""
     pair_chunks: int = 0
     met: int = 0
-    """Largest number of shared unknowns touched by rows at the points of a group."""
+    """Largest number of shared unknowns involved in rows at the points of a group."""
     rows: tuple[tuple[str, int], ...] = ()
     """Number of rows of each observation group; for rows stored by point, the largest number at a point."""
 
@@ -57,7 +57,7 @@ class Places(NamedTuple):
 
 
 GROUP = 32
-"""Number of points that share a list of the unknowns that their rows touch (`MetUnknowns`)."""
+"""Number of points that share a list of the unknowns that their rows involve (`MetUnknowns`)."""
 CHUNK, PAIRS = 64, 16
 """Number of rays, and of pairs of rays, per chunk. Half or double these sizes change the solution time by less than 10
 %, for blocks of 31 to 200 images and points of five to twenty rays.
@@ -85,7 +85,7 @@ def sizes_of(structure: Structure) -> PaddedSizes:
 
 
 class MetUnknowns(NamedTuple):
-    """Shared unknowns that rows at points touch, by group of points."""
+    """Shared unknowns that rows at points involve, by group of points."""
 
     group_of: Int[np.ndarray, "points"]
     key: Int[np.ndarray, "met"]

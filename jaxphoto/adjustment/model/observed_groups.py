@@ -1,10 +1,10 @@
-"""Groups of observations except image points: index arrays of the unknowns that each row touches, built once on the
+"""Groups of observations except image points: index arrays of the unknowns that each row involves, built once on the
 host.
 
-The unknowns that rows of a group touch determine how they enter the normal equations:
+The unknowns that rows of a group involve determine how they enter the normal equations:
 
     reduced     no point: rows add to the reduced normal matrix of images and shared unknowns
-    point       one point and no image: rows add to the block of the point before it is eliminated, and touch few
+    point       one point and no image: rows add to the block of the point before it is eliminated, and involve few
                 shared unknowns (`layout.padded.RayLists.met`)
     coupled     all others, such as two points, or a point and an image: few rows, represented by extra unknowns
                 (`solver.normal`)
@@ -61,7 +61,7 @@ class RowsAtPoints(NamedTuple):
 
 
 class ObservedGroup(eqx.Module):
-    """Group of observations: index arrays of its rows and of the objects they touch, rows last."""
+    """Group of observations: index arrays of its rows and of the objects they involve, rows last."""
 
     name: str = eqx.field(static=True)
     elimination: RowElimination = eqx.field(static=True)
@@ -74,12 +74,12 @@ class ObservedGroup(eqx.Module):
     rows: RowsInList | RowsAtPoints
     """Indices only; the observed values are in `Values.groups`."""
     image: Int[np.ndarray, "k rows"]
-    """Images that a row touches."""
+    """Images that a row involves."""
     point: Int[np.ndarray, "j rows"]
     parameter: Int[np.ndarray, "p *_"]
-    """Indices of the parameters that a row touches in the vector of shared parameters; its length if there is none. The
-    parameters of each image come first, table by table, then the parameters of the other arguments. (p, rows), or by
-    point (p, rows, points).
+    """Indices of the parameters that a row involves in the vector of shared parameters; its length if there is none.
+    The parameters of each image come first, table by table, then the parameters of the other arguments. (p, rows), or
+    by point (p, rows, points).
     """
     place: tuple[int, ...] = eqx.field(static=True)
     """Indices of the parameters that are unknown in at least one row."""

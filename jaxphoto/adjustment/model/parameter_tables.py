@@ -65,8 +65,8 @@ class JointPrior(NamedTuple):
 
 
 def tables_of(block: Block, unknowns: Unknowns, offset: int) -> tuple[ParameterTable, ...]:
-    """Return the declared parameters of a block in order: parameters that modify cameras, parameters that points touch,
-    others.
+    """Return the declared parameters of a block in order: parameters that modify cameras, parameters that rows at
+    points involve, others.
     """
     met = {kind for rows in block.observations if "image" not in dict(rows.indices()) for kind in rows.block_parameters}
     given = [(kind, owners) for kind, owners in unknowns.tables.items() if owners]

@@ -1,4 +1,4 @@
-"""Residuals of observation groups and their derivatives with respect to the unknowns that each row touches.
+"""Residuals of observation groups and their derivatives with respect to the unknowns that each row involves.
 
 A row is a function of few variables: the increments z of its images (6 each), its shared unknowns and its points (3
 each). All rows of a group are evaluated together and differentiated automatically; no dense Jacobian is formed. Rows
@@ -25,7 +25,7 @@ from jaxphoto.rotation import small_rotation
 
 
 class RowVariables(NamedTuple):
-    """Increments of the unknowns that one row touches, or derivatives with respect to them."""
+    """Increments of the unknowns that one row involves, or derivatives with respect to them."""
 
     eop: Float[Array, "k 6"]
     shared: Float[Array, "l"]

@@ -2,7 +2,7 @@
 
     unknowns    eop (6 per image: X, Y, Z, small rotation), shared (interior orientation, mounts, strips; only what
                 is not FIXED; interior orientations first), points (3 per point)
-    colours     an image touches few shared unknowns; unknowns of different cameras, mounts or strips share a
+    colours     an image depends on few shared unknowns; unknowns of different cameras, mounts or strips share a
                 colour, so one tangent vector differentiates all of them
     groups      all observations except image rows, see `observed_groups`
     rays        image rows, each of one image and one point; computations use a `layout.padded.PaddedStructure`,
@@ -63,7 +63,7 @@ class AbstractStructure(eqx.Module):
     n_points: int = eqx.field(static=True)
     corrections: Corrections = eqx.field(static=True)
     n_interior: int = eqx.field(static=True)
-    """Number of shared unknowns that image rows touch (cameras and the parameters that modify them); they come first.
+    """Number of shared unknowns that image rows involve (cameras and the parameters that modify them); they come first.
     """
     n_image_colours: int = eqx.field(static=True)
     free: Int[np.ndarray, "shared"]
@@ -123,7 +123,7 @@ class AbstractStructure(eqx.Module):
 
     @property
     def with_shared(self) -> tuple[ObservedGroup, ...]:
-        """Groups of rows stored by point that touch shared unknowns."""
+        """Groups of rows stored by point that involve shared unknowns."""
         return tuple(g for g in self.observed if isinstance(g.rows, RowsAtPoints) and g.place)
 
     @property
@@ -278,7 +278,7 @@ def _colours(block: Block, given: ObservedRows, free: np.ndarray) -> tuple[np.nd
     for kind, names in kinds.items():
         base[kind] = count
         if not any(name is not None for name in names):
-            # No image touches the scanner.
+            # No image depends on the scanner.
             continue
         count += max((seen[o] + 1 for o in seen if o.split(":")[0] == kind), default=0)
         if kind == "c" or kind in modifies_interior:

@@ -154,7 +154,7 @@ def _pull_others(z: NonImageResiduals, jacobians: tuple[RowJacobian, ...], at: L
 def _of_many(function: Callable[[Any], Any], values: Any, many: int, s: PaddedStructure) -> Any:
     """Map `function` over the leading axes of `values`, limiting the number at a time to the available memory.
 
-    Every row contains elements of all unknowns it touches.
+    Every row contains elements of all unknowns it involves.
     """
     most = rows_at_once(sum(g.components * g.n_rows * len(g.parameter) for g in s.observed))
     if many <= most:

@@ -7,9 +7,9 @@ With S~ = [S g; g' -K] the reduced matrix bordered by the few rows that couple p
     Q_pp  = L^-T (I + F' Q~ F) L^-1                 3 x 3 per point
     j Q j' = z'z + (j_r - F z)' Q~ (j_r - F z)      of an image row with derivatives j_r and j_p, z = L^-1 j_p'
 
-summed over rays and pairs of rays. The same formulas apply to rows stored by point that touch shared unknowns. The full
-matrix is never inverted. In a free network the component along the open motions, which the datum constraints fix, is
-subtracted: the result is the covariance under inner (or minimal) constraints.
+summed over rays and pairs of rays. The same formulas apply to rows stored by point that involve shared unknowns. The
+full matrix is never inverted. In a free network the component along the undetermined motions, which the datum
+constraints fix, is subtracted: the result is the covariance under inner (or minimal) constraints.
 """
 
 from typing import NamedTuple
@@ -193,7 +193,7 @@ def _of_images(full: Array, seen: _Propagated, reduced: Reduced, at: Linearised)
 
 
 def _of_group(full: Array, rows: RowsOfPoints, seen: _Propagated, reduced: Reduced, s: PaddedStructure) -> Array:
-    """Return j Q j' of rows stored by point that touch shared unknowns."""
+    """Return j Q j' of rows stored by point that involve shared unknowns."""
     first = interior_in_border(s) + len(reduced.k) + 1
 
     def one(numbers):
@@ -216,8 +216,8 @@ def _of_group(full: Array, rows: RowsOfPoints, seen: _Propagated, reduced: Reduc
 def _without_open_motions(q: Cofactors, at: Linearised, factored: FactoredNormal) -> Cofactors:
     """Subtract E E': the component of the cofactors along the motions that the datum constraints D fix.
 
-    E = (N + D'D)^-1 D' spans these motions exactly, because they are in the null space of N. If all motions are open,
-    they are known in advance.
+    E = (N + D'D)^-1 D' spans these motions exactly, because they are in the null space of N. If all motions are
+    undetermined, they are known in advance.
     """
     defect = len(at.values.datum_eop)
     if not defect:

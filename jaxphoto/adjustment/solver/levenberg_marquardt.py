@@ -208,8 +208,8 @@ _FIRST_DAMPING, _GROWTH = 1e-8, 2.0
 # Ratio of actual to predicted reduction above which a step is accepted. Minimum factor of the damping after an accepted
 # step; it decreases with that ratio (Nielsen's rule).
 _ACCEPT, _LEAST_FACTOR = 0.001, 0.2
-# Ratio of actual to predicted reduction below which a step is curved; ratio above which a curve is not shortened
-# further; minimum fraction t.
+# Ratio of actual to predicted reduction below which a step is replaced by a curve; ratio above which a curve is not
+# shortened further; minimum fraction t.
 _GOOD, _ENOUGH, _SHORTEST = 0.75, 0.25, 0.1
 # Maximum displacement by the curvature as a fraction of the step, in the metric of diag(N): 2 |a| / |v| < 1.5
 # (Transtrum, Sethna).
@@ -449,7 +449,7 @@ class LevenbergMarquardt(optx.AbstractLeastSquaresSolver[Vector, Scalar, Any, So
         bent = jnp.sqrt(self._dot(p.half, weight * p.half) / self._dot(p.step, weight * p.step))
         begin = jnp.minimum(_BENT / bent, 1.0)
         stages = [tighten, fresh, bend, near, shorten]
-        # Restore the iterate after a rejected step, the straight step after a diverged curve.
+        # After a rejected step restore the iterate; after a curve that diverged restore the straight step.
         t = jnp.select(stages, [0.0, 1.0, h, begin, state.t / 2], jnp.where(accept, 1.0, 0.0))
         reached = as_vector(after(self._at(y, loose), self.increments(p.part(t, diverged)), system.reduced.weight))
         progress = SolverState(

@@ -16,7 +16,7 @@ from jaxphoto.compiling import once
 
 
 class RowsOfPoints(NamedTuple):
-    """Rows that touch a point and shared unknowns: residuals, and derivatives with respect to both."""
+    """Rows that involve a point and shared unknowns: residuals, and derivatives with respect to both."""
 
     residual: Float[Array, "c rows points"]
     shared: Float[Array, "c l rows points"]
@@ -42,7 +42,7 @@ class NonImageRows(NamedTuple):
     b: Float[Array, "3 points"]
     """Sums of J_p' r over the rows at each point."""
     at_points: tuple["RowsOfPoints", ...]
-    """Rows that also touch shared unknowns (`AbstractStructure.with_shared`)."""
+    """Rows that also involve shared unknowns (`AbstractStructure.with_shared`)."""
     rows_e: Float[Array, "constraints images 6"]
     """Coupled rows: observations, then datum constraints."""
     rows_s: Float[Array, "constraints shared"]
@@ -54,7 +54,7 @@ class NonImageRows(NamedTuple):
 class NormalSums(NamedTuple):
     """Sums of the normal equations of images and shared unknowns (see `normal`), before points are eliminated.
 
-    Shared unknowns have one extra column, for rows that touch none.
+    Shared unknowns have one extra column, for rows that involve none.
     """
 
     band: tuple[Float[Array, "inner 2w 6 w 6"], Float[Array, "w 6 w 6"]]
@@ -122,7 +122,7 @@ def _coupled(g: ObservedGroup, j: RowJacobian, s: PaddedStructure, n_points: int
 
 
 def add_non_image_rows(sums: NormalSums, rest: NonImageRows, s: PaddedStructure) -> NormalSums:
-    """Add the sums of all rows that touch images and shared unknowns."""
+    """Add the sums of all rows that involve images and shared unknowns."""
     for g, j in zip(s.observed, rest.jacobians, strict=True):
         if g.elimination == "reduced":
             sums = _add_reduced(sums, g, j, s)
@@ -142,7 +142,7 @@ def _add_reduced(sums: NormalSums, g: ObservedGroup, j: RowJacobian, s: PaddedSt
             which, row, column, turned = jnp.asarray(g.pair[pair]).T
             pair += 1
             same = (jnp.asarray(g.image[other]) == image)[:, None, None]
-            # A row that touches an image twice: both halves of the product belong to that image.
+            # A row that involves an image twice: both halves of the product belong to that image.
             both = jnp.where(same, across + across.transpose(0, 2, 1), 0.0)
             u = u + sum_by(both.reshape(-1, 36), image, s.n_images).reshape(-1, 6, 6)
             across = jnp.where(turned[:, None, None] > 0, across.transpose(0, 2, 1), across)

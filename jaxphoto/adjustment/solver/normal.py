@@ -6,10 +6,10 @@ In scaled increments, with e the exterior orientations, s the shared unknowns an
     N = [ Us'  Uss  Ws'] [s] = [b_s]        V block-diagonal (3 x 3 per point), W 6 x 3 per ray
         [ W'   Ws   V  ] [p]   [b_p]
 
-Few rows couple points, D: distances, all rows that touch two points or a point and an image (`model.observed_groups`),
-and the datum constraints. Their part D'D of N is represented by extra unknowns mu = D x with the block -I, so V stays
-block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D_p', and D_r the part of D for images and shared
-unknowns:
+Few rows couple points, D: distances, all rows that involve two points or a point and an image
+(`model.observed_groups`), and the datum constraints. Their part D'D of N is represented by extra unknowns mu = D x with
+the block -I, so V stays block-diagonal. With V = L L', Y = W L^-T, Ys = L^-1 Ws, Yd = L^-1 D_p', and D_r the part of D
+for images and shared unknowns:
 
     S   = [U Us; Us' Uss] - [Y; Ys'] [Y; Ys']'        the reduced normal matrix
     g   = D_r' - [Y; Ys'] Yd,   K = I + Yd' Yd        the coupling of mu

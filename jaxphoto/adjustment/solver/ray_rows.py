@@ -1,6 +1,6 @@
 """Residuals of a batch of rays and their derivatives, in all slots at once.
 
-A row touches one image, one point and the parameters of one camera. Rays are stored in chunks of one image, so
+A row involves one image, one point and the parameters of one camera. Rays are stored in chunks of one image, so
 quantities that depend only on the image are computed once per chunk. Each column of the Jacobian is one forward
 derivative of `image_residual`, mapped over chunks and rays. Arrays end in (m, p): chunks, rays of a chunk.
 """

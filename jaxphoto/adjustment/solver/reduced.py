@@ -153,7 +153,7 @@ class _Eliminated(NamedTuple):
 
 
 def _eliminated(sums: _AtPoints, rest: NonImageRows, met: Array, scale: Array, damping, s: PaddedStructure):
-    """Return L of each point and F of its border; `met` is W of shared unknowns that its rows touch."""
+    """Return L of each point and F of its border; `met` is W of shared unknowns that its rows involve."""
     k, n, i = len(rest.coupled), len(sums.v), interior_in_border(s)
     if not s.rays.free_points:
         unit, none = jnp.array([1.0, 0, 1, 0, 0, 1])[:, None], jnp.zeros((3, n))
@@ -213,7 +213,7 @@ def linearise_rows(
 
 
 def _met_of_rays(j: tuple[RayJacobian, RayJacobian], s: PaddedStructure) -> Float[Array, "m p d e"]:
-    """Return W of a batch; without rows if no point is free."""
+    """Return the coupling W of images and points for the rays of a batch; empty if no point is free."""
     eop = [jnp.concatenate([o.eop, o.shared]) if s.rays.by_image else o.eop for o in j]
     e, *shape = eop[0].shape
     if not s.rays.free_points:

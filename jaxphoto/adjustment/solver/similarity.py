@@ -68,7 +68,7 @@ def motions(
 
 
 def n_open_motions(values: AbstractValues, s: AbstractStructure) -> int:
-    """Return the number of open motions if these are all seven, or all but the scale if distances determine it; else 0.
+    """Return the number of undetermined motions: seven, six if distances determine the scale, 0 in all other cases.
 
     Such motions change only the residuals of the datum constraints, at any position of images and points. Other motions
     (a rotation about the only control point, a shift compensated by the shift of a strip) depend on the position, or on
@@ -115,8 +115,8 @@ def after(at: Linearised, step: Increments, weight: Increments) -> Increments:
     """Return the increments after `step`: its common motion is applied as a similarity, the rest is added.
 
     A rotation of the whole block that is added to the increments would distort the block. If few observations determine
-    its position, that distortion alone would decide on the step. The similarity is separated in the metric of `weight`.
-    Steps of a free network are added: its constraints are linear.
+    its position, that distortion alone would determine whether the step is accepted. The similarity is separated in the
+    metric of `weight`. Steps of a free network are added: its constraints are linear.
     """
     (y, scale, values, s), state = at, at.state
     if n_open_motions(values, s):

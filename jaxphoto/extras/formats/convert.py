@@ -247,7 +247,7 @@ def write_camera_file(
             # JSON has no comments.
             if note and chosen.comment and path.suffix.lower() != ".json":
                 text = work.read_text(encoding="utf-8")
-                # Keep the first line of OpenCV's YAML and of XML first. Two dashes would end an XML comment.
+                # The first line of OpenCV's YAML and of XML must remain the first. Two dashes would end an XML comment.
                 first, end, rest = text.partition("\n") if text.startswith(("%YAML", "<?xml")) else ("", "", text)
                 work.write_text(
                     f"{first}{end}{chosen.comment.format(note.replace('--', '- -'))}\n{rest}", encoding="utf-8"

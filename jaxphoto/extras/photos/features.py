@@ -27,14 +27,14 @@ def read_grey(path: str | Path) -> UInt8[np.ndarray, "rows columns"]:
     photographs([path])
     try:
         picture = cv2.imdecode(np.frombuffer(path.read_bytes(), np.uint8), _FLAGS)
-    except (OSError, cv2.error):  # cv2.error: empty files and pictures that are too large
+    except (OSError, cv2.error):  # cv2.error: empty files and images that are too large
         picture = None
     if picture is None:
-        raise InputError(f"{path}: OpenCV cannot read this picture, or it is truncated; give a TIFF, PNG or JPEG")
+        raise InputError(f"{path}: OpenCV cannot read this image, or it is truncated; give a TIFF, PNG or JPEG")
     if picture.dtype == np.uint8:
         return picture
     if picture.dtype.kind not in "iu" or picture.min() < 0:
-        raise InputError(f"{path}: its grey values are {picture.dtype}; give an unsigned picture of 8 or 16 bits")
+        raise InputError(f"{path}: its grey values are {picture.dtype}; give an unsigned image of 8 or 16 bits")
     return np.right_shift(picture, max(0, int(picture.max()).bit_length() - 8)).astype(np.uint8)
 
 
@@ -124,7 +124,7 @@ def _read(photograph: Path, sensor: Sensor) -> np.ndarray:
     height, width = picture.shape
     if (width, height) != (sensor.width_px, sensor.height_px):
         raise InputError(
-            f"{photograph}: the picture has {width} x {height} pixels, the camera {sensor.width_px} x "
-            f"{sensor.height_px}; give the original picture, or its camera"
+            f"{photograph}: the photograph has {width} x {height} pixels, the camera {sensor.width_px} x "
+            f"{sensor.height_px}; give the original photograph, or its camera"
         )
     return picture

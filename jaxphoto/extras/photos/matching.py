@@ -163,7 +163,7 @@ _MIN_RATIO = 0.3
 # distortion.
 _OFF_LINE = 0.003
 # Quantile that defines the scatter, and the same quantile in standard deviations of a normal distribution. The median
-# ignores the long tails of the features; the sum of squares is sensitive to remaining false matches.
+# ignores the long tails of the distribution; the sum of squares is sensitive to remaining false matches.
 _QUANTILE, _QUANTILE_SIGMA = 0.9, 1.6449
 _BLANK = "no features: blank or out of focus"
 _ALONE = f"fewer than {MIN_MATCHES} points in common with each compared photograph"

@@ -126,8 +126,8 @@ def assemble(source: BlockTables) -> Block:
     for name in keys.observations:
         if name not in known:
             raise InputError(
-                f"{source.file}, observations: jaxphoto has no class for {name}.csv; give yours to "
-                "read_block(folder, more=(...,)), or remove the name, and the observations are not used"
+                f"{source.file}, observations: no class is known for {name}.csv; pass it as read_block(folder, "
+                "more=(...,)), or remove the name to ignore these observations"
             )
     tables = {}
     for name, layout in known.items():
@@ -151,7 +151,7 @@ def assemble(source: BlockTables) -> Block:
 
     cameras = {name: camera for name, camera in settings.cameras.items() if name in images.cameras}
     if unused := [name for name in settings.cameras if name not in cameras]:
-        _warn(f"{source.file}: no image is taken by camera {', '.join(unused)}, which is not used")
+        _warn(f"{source.file}: cameras without images are not used: {', '.join(unused)}")
     mounts, mount_priors = read_mounts(top.section("mounts"), settings.cameras)
     mount_of = mounts_of(cameras, mounts)
     used = [name for name in mounts if name in mount_of.values()]

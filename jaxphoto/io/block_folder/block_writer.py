@@ -71,7 +71,7 @@ def _write_files(block: Block, folder: Path) -> None:
     (folder / TOML).write_text(toml_text(settings), encoding="utf-8")
     for name, frame in tables.items():
         if len(frame) or (name in LAYOUTS and LAYOUTS[name].required):
-            # Quote ids that start with #: the first one would make its line a comment.
+            # Quote ids that start with #: unquoted, the first id of a line would make the line a comment.
             comment = frame.iloc[:, 0].astype(str).str.startswith("#").any()
             quoting: Literal[0, 2] = csv.QUOTE_NONNUMERIC if comment else csv.QUOTE_MINIMAL
             frame.to_csv(folder / f"{name}.csv", index=False, quoting=quoting)

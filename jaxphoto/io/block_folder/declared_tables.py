@@ -229,8 +229,8 @@ def declared_tables(block: Block) -> dict[str, pd.DataFrame]:
         elif isinstance(rows, AbstractObservations):
             if type(rows).group in LAYOUTS:
                 raise BlockError(
-                    f"Block.more has {rows.group}, but {rows.group}.csv is for those of Block.{rows.group}; join them "
-                    "with these, or give them covariances (observations.correlated)"
+                    f"Block.more contains {rows.group}, but {rows.group}.csv is reserved for Block.{rows.group}; move "
+                    "them there, or give them covariances (observations.correlated)"
                 )
             plain.setdefault(type(rows), []).append(rows)
     tables = {kind.group: _table(kind.joined(*groups), names) for kind, groups in plain.items()}

@@ -140,7 +140,8 @@ def check_motion_held(block: Block) -> None:
         if reference not in held:
             raise BlockError(
                 f"the delay of {RigCamera.kind}[{camera}] needs the motion of image {block.images[reference]}, which "
-                "stations.csv and attitudes.csv hold: give it a station and an attitude, or fix the delay at zero"
+                "is stored in stations.csv and attitudes.csv: add a station and an attitude of it, or fix the delay "
+                "at zero"
             )
 
 

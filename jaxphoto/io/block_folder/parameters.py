@@ -205,7 +205,7 @@ def read_unknowns(section: Section, kinds: Iterable[Kind], block: Block) -> tupl
         if name not in known:
             raise section.error(
                 name,
-                "jaxphoto has no class for these unknowns; give yours to read_block(folder, more=(...,)), or use "
+                "no class is known for these unknowns; pass it as read_block(folder, more=(...,)), or use  "
                 + ", ".join(known),
             )
     for name, kind in known.items():

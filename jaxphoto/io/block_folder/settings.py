@@ -155,7 +155,7 @@ def read_settings(values: dict[str, Any], file: str = TOML, sigma_keys: Sequence
         raise top.error("", "no cameras; add a table [cameras.NAME] with its format and interior orientation")
     cameras = top.section("cameras")
     if "default" in cameras:
-        raise cameras.error("default", "this name means every camera in [mounts]; give the camera another one")
+        raise cameras.error("default", "default means every camera in [mounts]; give the camera another name")
     over = keys.datum.over
     datum = Datum(keys.datum.kind, tuple(over) if isinstance(over, list) else over, keys.datum.scale)
     return Settings(

@@ -75,7 +75,7 @@ def read_recipe(path: str | Path) -> Recipe:
     """Read a recipe from a TOML file. Raises InputError with file, key and cure."""
     path = Path(path)
     if not path.is_file():
-        raise InputError(f"there is no file {path}; give the TOML file of a recipe")
+        raise InputError(f"file not found: {path}; give the TOML file of a recipe")
     return recipe_from(read_toml(path), path.name)
 
 
@@ -110,7 +110,7 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     ties = keys.points.ties or 0
     points = ties + sum(t.count + len(t.at) + len(t.at_m) for t in targets)
     if points < 3:
-        raise InputError(f"{file}, [points] ties: {points} points in total; ask for more than 2")
+        raise InputError(f"{file}, [points] ties: {points} points in total; request more than 2")
     stated_sigmas, noise = _sigmas(top, keys, targets)
     if rig.values and (stated_sigmas.rig_place_m is None or stated_sigmas.rig_turn_deg is None):
         raise top.section("sigmas").error("", "the rigidity of the rig is missing; add rig_place_m and rig_turn_deg")

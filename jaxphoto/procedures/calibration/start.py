@@ -247,7 +247,7 @@ def distortion_model(name: str, sensor: Sensor, r0_mm: float = 0.0) -> AbstractD
     kind, longer = AbstractDistortion.called(name), max(sensor.width_mm, sensor.height_mm)
     if kind is Smac:
         if not 0 <= r0_mm <= longer:
-            raise InputError(f"R0 = {r0_mm:g} mm does not lie on an image of {longer:.4g} mm; give 0 to {longer:.4g}")
+            raise InputError(f"R0 = {r0_mm:g} mm is outside the format of {longer:.4g} mm; give 0 to {longer:.4g}")
         return Smac(r0=r0_mm)
     if r0_mm:
         raise InputError(f"R0 belongs to the model smac; omit it with {name}, or choose smac")
@@ -337,7 +337,7 @@ def flat_start(
 
 
 def _determines(board: Float[np.ndarray, "n 2"]) -> bool:
-    """Return True if points of a plane determine a homography: the only map onto themselves is the identity."""
+    """Return True if points of a plane determine a homography: only the identity maps them onto themselves."""
     xy = (board - board.mean(axis=0)) / max(float(np.std(board)), 1e-300)
     point = np.column_stack([xy, np.ones(len(xy))])
     rows = [np.hstack([point, 0 * point, -xy[:, :1] * point]), np.hstack([0 * point, point, -xy[:, 1:] * point])]

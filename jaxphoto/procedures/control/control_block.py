@@ -426,7 +426,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     line = len(known) >= MIN_POINTS and on_a_line(met[known], frame.xyz[known])
     if frame.at_place and (line or len(known) < MIN_POINTS):
         how = " lie on a line, so the rotation about it is undetermined" if line else ""
-        stays = f"the block stays {'at its positions' if by_positions else 'where it lies'}"
+        stays = f"the block {'remains in the frame of its positions' if by_positions else 'is not transformed'}"
         messages = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
         return block, met, agree, messages
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
@@ -437,12 +437,12 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
         spread = spread * first.similarity.scale
     onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file)
     agree[known] = onto.agree
-    messages = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} bring the block to their frame"]
+    messages = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} define the frame of the block"]
     if frame.at_place:
         off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
         offset = ", ".join(f"{v:.2f}" for v in np.round(off, 2) + 0.0)
-        there = "the positions of the photographs have" if by_positions else "the block has"
-        messages.append(f"control lies {offset} m (east, north, up) from where {there} it")
+        there = "the positions of the photographs" if by_positions else "the block"
+        messages.append(f"offset of the control from {there}: {offset} m (east, north, up)")
     block = dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame)
     return block, onto.similarity.of(met), agree, messages
 
@@ -479,7 +479,7 @@ def _tested(tested: TestedControl, now: Marked, used, able, ids, images):
     if not worst > CRITICAL:
         back = able & ~used & ~beyond(tested.w) & np.isfinite(tested.w).any(axis=1)
         return new | back, rejected, [""] * bool(back.any())
-    # A blunder often causes smaller residuals nearby.
+    # A blunder often causes further, smaller residuals nearby.
     limit = max(CRITICAL, _BESIDE_THE_WORST * worst)
     for p in np.unique(now.point).tolist():
         row = max(np.flatnonzero(now.point == p), key=lambda k: of_marks[k])

@@ -169,7 +169,7 @@ def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, 
 
 
 def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:
-    """Mark the rays of one point that pass the position of most of them; all False if no two rays meet."""
+    """Mark the rays of one point that pass the position of most of them; all False if no two rays intersect."""
     n = len(origins)
     pairs = list(combinations(range(n), 2))
     pairs = [pairs[k] for k in np.linspace(0, len(pairs) - 1, min(len(pairs), _PAIRS)).astype(int)]

@@ -31,7 +31,8 @@ _LARGEST = 0.5
 # First iteration with rejection, because the orientation may be inaccurate before; iteration after which rejections are
 # final.
 _JUDGED, _SETTLED = 2, 5
-# Maximum difference of equal observations, in standard deviations; iteration after which observations are constant.
+# Maximum difference of observations that are treated as equal, in standard deviations; iteration after which
+# observations are constant.
 _SAME, _LAST_LOOK = 0.5, 8
 # Maximum ratio of the initial distance of points from the cloud to the height above it: error of the principal
 # distance.
@@ -134,7 +135,8 @@ def with_common_error(
 ) -> Float[np.ndarray, "rows"]:
     """Return standard deviations whose mean over n rows preserves a common error: sigma^2 + (n - 1) common^2.
 
-    `sigma` contains the common error once. Adjustment treats its observations as independent, which would average it.
+    `sigma` contains the common error once. An adjustment treats observations as independent, which would average out
+    the common error.
     """
     return np.sqrt(sigma**2 + max(int(usable.sum()) - 1, 0) * common_m**2)
 
@@ -215,7 +217,7 @@ def _check_heights(first: Adjustment, surface: SurfaceAtPoints) -> None:
 
 
 def _check_used(surface: SurfaceAtPoints, used: Bool[np.ndarray, "rows"]) -> None:
-    """Raise BlockError if the block contradicts the cloud at most points."""
+    """Raise BlockError if the block contradicts the cloud at the majority of the points."""
     n, most = int(used.sum()), int(surface.usable.sum())
     if n < max(1.0, _BORNE_OUT * most):
         raise BlockError(

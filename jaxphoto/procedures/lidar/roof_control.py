@@ -168,7 +168,7 @@ def _centroid_rows(
     parts = [ControlCoordinates.none()]
     for point, face in zip(points, _faces(places[points, :2], patches, 0.0), strict=True):
         if point in block.control.who:
-            raise InputError(f"point {block.points[point]} is control already: omit it from the centroids")
+            raise InputError(f"point {block.points[point]} is already control: omit it from the centroids")
         if face < 0:
             raise BlockError(
                 f"point {block.points[point]} is to be the centroid of a roof, but the cloud has no roof face at X "

@@ -142,12 +142,12 @@ def adjust_strips(
     attitudes are assumed to come from the trajectory.
 
     `control` contains surveyed points on smooth surfaces, in the cloud's system (m): planes near them are observed to
-    pass through them. Its check points are only compared. Without a trajectory control also defines the datum.
+    pass through them. Its check points are only compared. Without a trajectory, control also defines the datum.
 
     `priors` are the priors of the scanner and include its pattern; by default lines, its boresight FREE and all else
     FIXED. For circular patterns, forward and backward looks of a strip are also compared. `fixed` are strips whose
-    trajectory is not corrected, or "all". Without a trajectory each strip has only a shift, and by default the first is
-    fixed in the directions that control does not determine.
+    trajectory is not corrected, or "all". Without a trajectory, each strip has only a shift, and by default the first
+    is fixed in the directions that control does not determine.
     """
     settings = StripSettings() if settings is None else settings
     if trajectory is None and priors is not None:

@@ -182,7 +182,7 @@ def _select_planes(planes: PointPlanes, chosen: Bool[np.ndarray, "n"]) -> PointP
 
 
 def _also_in_block(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "points"]:
-    """Mark control that also belongs to the block. Raises InputError for names of other points there."""
+    """Mark control that also belongs to the block. Raises InputError if it differs there or is not control."""
     place, again = {name: k for k, name in enumerate(block.points)}, np.zeros(len(control.ids), bool)
     surveyed = [(rows.who, rows.axis, np.asarray(rows.value)) for rows in (block.control, block.fixed)]
     who, axis, value = (np.concatenate(v) for v in zip(*surveyed, strict=True))
@@ -203,9 +203,9 @@ def _also_in_block(block: Block, control: SurveyedPoints) -> Bool[np.ndarray, "p
 
 # Gap between each surveyed point and each strip after the adjustment, with its expected scatter.
 #
-# The gap g = n . (X - F') of a surveyed point X above its foot F' on the plane of a strip has the variance s^2 of plane
-# and survey. F' depends on the unknowns x with covariance C: a = d(n . F')/dx. The unknowns have absorbed part of the
-# errors of adjusted control:
+# The gap g = n . (X - F') of a surveyed point X above its foot point F' on the plane of a strip has the variance s^2 of
+# plane and survey. F' depends on the unknowns x with covariance C: a = d(n . F')/dx. The unknowns have absorbed part of
+# the errors of adjusted control:
 #
 #     var(g) = s^2 - a C a'    for adjusted control,        s^2 + a C a'    for check points, and rejected control
 #
@@ -222,7 +222,7 @@ class SurveyedGap(NamedTuple):
     role: Literal["control", "check"]
     strip: str
     dX_m: float
-    """Surveyed point minus its foot on the corrected plane of the strip."""
+    """Surveyed point minus its foot point on the corrected plane of the strip."""
     dY_m: float
     dZ_m: float
     gap_m: float
@@ -267,7 +267,7 @@ def surveyed_gaps(
 def _variance_of_foot(
     f: PointPlanes, errors: StripErrors, path: ScannerPath | None, adjusted: Adjustment, cov: Covariance
 ) -> Float[np.ndarray, "n"]:
-    """Return the a priori variance a C a'."""
+    """Return the a priori variance a C a' of the foot point."""
     side = side_of(f.patches, f.found.patch, f.found.foot, f.look.strip, errors, path)
     errors_at = np.concatenate([errors.position, errors.attitude], axis=1)[side.knots]
     errors_at = np.einsum("nk,nkc->nc", side.weights, errors_at)
@@ -296,7 +296,7 @@ def _slopes(
     boresight: Float[Array, "3"],
     calibration: ScannerCalibration,
 ) -> tuple[Float[Array, "n 6"], Float[Array, "n 3"], Float[Array, "n calibrated"]]:
-    """Differentiate the foot's height along the normal by trajectory error, boresight and scanner calibration."""
+    """Differentiate the height of the foot point along n by trajectory error, boresight and scanner calibration."""
     numbers, back = ravel_pytree(calibration)
 
     def height(offset, boresight, numbers, normal, point, position, angles, velocity, rate):

@@ -301,7 +301,8 @@ def step_rows(
     part, none = decay[:, None] ** 2, np.zeros((len(start), 3))
 
     def new(sigma: Float[np.ndarray, "knots 3"]) -> Float[np.ndarray, "steps 3"]:
-        # Limit from below: if errors decrease faster than their correlation decays, new variance is still added.
+        # Limit from below: the variance of a step must remain positive if the sigmas decrease faster than the
+        # correlation decays.
         before, after = sigma[start] ** 2, sigma[start + 1] ** 2
         return np.sqrt(np.maximum(after - part * before, (1 - part) * np.minimum(before, after)))
 

@@ -112,7 +112,7 @@ def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.nda
     if names is None:
         free = np.setdiff1d(np.arange(len(block.points)), np.concatenate(observed).astype(int))
         if not len(free):
-            raise BlockError("the block has no tie point for a height from the cloud: name the points")
+            raise BlockError("the block has no tie point for a height from the cloud: give the points")
         return free
     place = {name: k for k, name in enumerate(block.points)}
     high = {int(p) for rows in (block.control, block.fixed) for p in np.asarray(rows.who)[rows.axis == 2]}
@@ -121,7 +121,7 @@ def tie_points(block: Block, names: Collection[str] | None = None) -> Int[np.nda
             raise InputError(f"unknown point {name}; choose points of image_points.csv")
         if place[name] in high:
             raise InputError(
-                f"the height of point {name} is control already: omit the point, or remove it from the control"
+                f"the height of point {name} is already control: omit the point, or remove it from the control"
             )
     return np.array(sorted(place[name] for name in set(names)), int)
 

@@ -171,7 +171,7 @@ def _check_connected(names: Sequence[str], verified: Sequence[PairMatches]) -> N
         by_name = [[names[i] for i in group] for group in groups]
         raise GroupsError(
             f"the images are {len(groups)} groups that have too few points in common to be oriented to one another "
-            f"({'; '.join(map(', '.join, by_name))}): orient each by itself, or add images that connect them",
+            f"({'; '.join(map(', '.join, by_name))}): orient each separately, or add images that connect them",
             by_name,
         )
 

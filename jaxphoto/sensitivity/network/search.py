@@ -182,7 +182,7 @@ def _checked(low: Design, high: Design) -> tuple[Design, Design]:
     """Return the bounds as arrays. Raises InputError unless every low bound is at most its high one."""
     low, high = (jax.tree.map(lambda v: np.asarray(v, float), tree) for tree in (low, high))
     if not _same_structure(low, high):
-        raise InputError("low and high are designs of different structure: give both the same variables")
+        raise InputError("low and high have different structures: give both the same variables")
     for (path, a), b in zip(jax.tree.leaves_with_path(low), jax.tree.leaves(high), strict=True):
         name = jax.tree_util.keystr(path).lstrip(".") or "the design variable"
         if a.shape != b.shape:
@@ -207,14 +207,14 @@ def _checked_starts(starts: Design, low: Design, high: Design) -> Design:
     """Return `starts` as arrays. Raises InputError for a start outside the bounds."""
     starts = jax.tree.map(lambda v: np.asarray(v, float), starts)
     if not _same_structure(starts, low):
-        raise InputError("the starts and the bounds are designs of different structure: give both the same variables")
+        raise InputError("the starts and the bounds have different structures: give both the same variables")
     leaves = zip(jax.tree.leaves_with_path(starts), jax.tree.leaves(low), jax.tree.leaves(high), strict=True)
     for (path, v), a, b in leaves:
         name = jax.tree_util.keystr(path).lstrip(".") or "the design variable"
         if v.shape[1:] != a.shape:
             raise InputError(
-                f"the starts of {name} have the shape {v.shape}, but one has {a.shape}: stack the starts along a "
-                "leading axis (stack_designs)"
+                f"the starts of {name} have the shape {v.shape}, but the variable has {a.shape}: stack the starts "
+                "along a leading axis (stack_designs)"
             )
         if ((v < a) | (v > b)).any():
             raise InputError(f"a start of {name} is outside its bounds: widen these or start elsewhere")
