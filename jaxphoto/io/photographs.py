@@ -514,7 +514,7 @@ def picture_files(paths: Sequence[str | Path]) -> list[Path]:
 
 
 def skipped_subfolders(paths: Sequence[str | Path]) -> dict[str, str]:
-    """Return subfolders with photographs that are not in `paths`, with a message each; not those that jaxphoto wrote."""
+    """Return subfolders with photographs that are not in `paths`, with messages; not those that jaxphoto wrote."""
     named, messages = {Path(path).resolve() for path in paths}, {}
     folders = (path for path in map(Path, paths) if path.is_dir())
     for inner in (inner for folder in folders for inner in sorted(folder.iterdir())):

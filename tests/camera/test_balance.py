@@ -80,9 +80,9 @@ def test_a_singular_radius_is_refused():
     # Subtracted, 1 - (K1 R0^2) = 0 at R0 = 5.
     singular = camera(k1=1 / 25)
     assert np.isfinite(rebalanced(singular, 4.9).c)
-    with pytest.raises(Exception, match="singular at R0 = .*: use a smaller R0"):
+    with pytest.raises(Exception, match=r"singular at R0 = .*: use a smaller R0"):
         jax.block_until_ready(rebalance(singular, 5.0))
-    with pytest.raises(Exception, match="singular at R0 = .*: use a smaller R0"):
+    with pytest.raises(Exception, match=r"singular at R0 = .*: use a smaller R0"):
         jax.block_until_ready(rebalance(singular, 6.0))
 
 
