@@ -6,12 +6,13 @@ import warnings
 from collections.abc import Callable, Collection, Iterator
 from contextlib import contextmanager
 from pathlib import Path
-from typing import Any, Literal, get_args
+from typing import TYPE_CHECKING, Any, Literal, get_args
 
 import numpy as np
 import pandas as pd
 from jaxtyping import Float, Real
 from pyproj import CRS, Transformer
+from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError
 
 from jaxphoto.block import Frame
@@ -22,6 +23,9 @@ from jaxphoto.georeferencing.map_frame import MapFrame, map_system
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.optional import extra
 from jaxphoto.writing import whole_file
+
+if TYPE_CHECKING:
+    import laspy
 
 Returns = Literal["all", "first", "last", "only"]
 """Selection by return: all returns of a pulse, first, last, or returns of single-return pulses."""
@@ -35,6 +39,9 @@ _CHUNK = 500_000
 _SCALE_M, _SCALE_DEG = 1e-3, 1e-8
 _XYZ = ("X_m", "Y_m", "Z_m")
 _RETURNS = ("return_number", "number_of_returns")
+# GeoTIFF keys (OGC 19-008r4): vertical system, units of the plane and of heights; EPSG's codes of systems and of feet.
+_VERTICAL_CRS, _UNITS = 4096, (3076, 4099)
+_EPSG_CODES, _FEET = range(1024, 32767), {9002, 9003}
 
 
 def read_cloud(
@@ -185,7 +192,7 @@ def cloud_placement(path: Path, frame: Frame | None, epsg: int | None = None) ->
 def cloud_system(path: Path, epsg: int | None = None) -> CRS | None:
     """Read the coordinate system of a cloud file; `epsg` overrides it."""
     if not path.is_file():
-        raise InputError(f"there is no file {path}; correct the name")
+        raise InputError(f"file not found: {path}")
     suffix = _suffix(path, copc=True)
     if epsg is not None:
         try:
@@ -196,9 +203,26 @@ def cloud_system(path: Path, epsg: int | None = None) -> CRS | None:
         return None
     with _open_las(path) as reader:
         try:
-            return reader.header.parse_crs()
+            return _with_heights(reader.header.parse_crs(), reader.header, path.name)
         except CRSError:
             raise InputError(f"{path.name} has a coordinate system unknown to PROJ; give it (--cloud-epsg)") from None
+
+
+def _with_heights(crs: CRS | None, header: "laspy.LasHeader", name: str) -> CRS | None:
+    """Add the vertical system of the GeoTIFF keys, which laspy does not read. Raises InputError for feet by key only."""
+    keys = {key.id: key.value_offset for record in header.vlrs.get("GeoKeyDirectoryVlr") for key in record.geo_keys}
+    if crs is None or not (crs.is_compound or len(crs.axis_info) == 3):
+        if crs is not None and keys.get(_VERTICAL_CRS, 0) in _EPSG_CODES:
+            vertical = CRS.from_epsg(keys[_VERTICAL_CRS])
+            crs = CompoundCRS(f"{crs.name} + {vertical.name}", [crs, vertical])
+        factors = Placement(name, crs, None).factors[[0, 2]]
+        for key, axes, factor in zip(_UNITS, ("X and Y", "Z"), factors, strict=True):
+            if keys.get(key) in _FEET and factor == 1.0:
+                raise InputError(
+                    f"{name} states feet for {axes} in its GeoTIFF keys, but its coordinate system does not; convert "
+                    "the file to metres"
+                )
+    return crs
 
 
 class Placement:

@@ -168,6 +168,34 @@ def test_units_are_those_of_the_system(tmp_path, crs, plane, height):
     np.testing.assert_allclose(clouds.read_cloud(path).xyz, xyz * [plane, plane, height], rtol=1e-15, atol=1e-9)
 
 
+def geo_keys(**keys):
+    """The record of GeoTIFF keys, as `k4099=9003`."""
+    rows = [(1, 1, 0, len(keys)), *((int(name[1:]), 0, 1, value) for name, value in keys.items())]
+    return laspy.VLR("LASF_Projection", 34735, "", np.array(rows, "<u2").tobytes())
+
+
+def test_vertical_system_and_units_of_geotiff_keys(tmp_path):
+    xyz = np.array([[500_000.0, 7_234_000.0, 900.0]])
+    for keys, vertical, metres in (
+        ({"k4096": 5703}, 5703, 1.0),
+        ({"k4096": 6360}, 6360, US_FT),
+        ({"k4099": 9001}, None, 1.0),
+    ):
+        path = write_las(tmp_path / "c.las", xyz, vlrs=[geo_keys(k3072=32722, **keys)], point_format=3)
+        placement = clouds.cloud_placement(path, None)
+        assert placement.vertical == vertical
+        np.testing.assert_allclose(placement.factors, [1.0, 1.0, metres], rtol=1e-12)
+        np.testing.assert_allclose(clouds.read_cloud(path).xyz, xyz * placement.factors, rtol=0, atol=1e-3)
+    for keys in (
+        {"k3072": 32722, "k4099": 9003},
+        {"k3072": 32767, "k3076": 9003},
+        {"k3072": 32722, "k4096": 5703, "k4099": 9002},
+    ):
+        path = write_las(tmp_path / "c.las", xyz, vlrs=[geo_keys(**keys)], point_format=3)
+        with pytest.raises(InputError, match=r"c\.las states feet for"):
+            clouds.read_cloud(path)
+
+
 def topocentric(longitude, latitude, height, origin=ORIGIN):
     """Local east, north, up on GRS 80's WGS 84, by the textbook."""
     a, f = 6378137.0, 1 / 298.257223563
