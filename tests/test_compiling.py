@@ -2,8 +2,10 @@
 
 import dataclasses
 import functools
+import hashlib
 import json
 import os
+import re
 import subprocess
 import sys
 from pathlib import Path
@@ -22,11 +24,14 @@ from jaxphoto.compiling import (
     fast_compilation,
     jit_quickly,
     options,
+    plain_tree,
+    private_folder,
     run,
     run_compiled,
     store,
 )
 from jaxphoto.compiling.description import Indescribable, describe
+from jaxphoto.compiling.plain_tree import Slot
 from tests.compiled_programs import MATRIX, root
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -88,13 +93,36 @@ def test_a_static_argument_is_part_of_the_key(kept):
     np.testing.assert_array_equal(again, square)
 
 
-@pytest.mark.parametrize("damage", ["cut", "changed", "empty", "other"])
+def entries(folder):
+    """The files of programs."""
+    return [path for path in folder.iterdir() if path.name != "secret"]
+
+
+@pytest.mark.parametrize("damage", ["cut", "changed", "empty", "other", "hashed", "unfit", "no JSON", "link", "pipe"])
 def test_a_damaged_file_is_written_anew(kept, damage):
     right, _ = calculate()
-    (path,) = kept.iterdir()
+    (path,) = entries(kept)
     content = path.read_bytes()
-    spoilt = {"cut": content[:-100], "changed": content[:82] + b"x" + content[83:], "empty": b"", "other": b"else"}
-    path.write_bytes(spoilt[damage])
+    path.unlink()
+    if damage == "link":
+        (kept / "elsewhere").write_bytes(content)
+        path.symlink_to(kept / "elsewhere")
+    elif damage == "pipe":
+        os.mkfifo(path)
+    elif damage in ("unfit", "no JSON"):
+        text = b'{"program": {}, "skeleton": null}' if damage == "unfit" else b"x"
+        private_folder.write(kept, path.name, len(text).to_bytes(8, "big") + text)
+    else:
+        path.write_bytes(
+            {
+                "cut": content[:-100],
+                "changed": content[:82] + b"x" + content[83:],
+                "empty": b"",
+                "other": b"something else",
+                # By what everybody knows, and not by the secret.
+                "hashed": hashlib.sha256(content[32:]).digest() + content[32:],
+            }[damage]
+        )
     again, loaded = calculate()
     assert not loaded
     np.testing.assert_array_equal(again, right)
@@ -103,22 +131,52 @@ def test_a_damaged_file_is_written_anew(kept, damage):
 
 def test_a_program_under_another_name_is_not_taken_for_it(kept):
     square, _ = calculate(2)
-    (first,) = kept.iterdir()
+    (first,) = entries(kept)
     calculate(3)
-    (second,) = set(kept.iterdir()) - {first}
+    (second,) = set(entries(kept)) - {first}
     first.write_bytes(second.read_bytes())
     again, loaded = calculate(2)
     assert not loaded
     np.testing.assert_array_equal(again, square)
 
 
-def test_what_others_could_have_written_is_not_run(kept):
+def test_what_others_could_have_written_is_not_run(kept, monkeypatch):
     calculate()
-    (path,) = kept.iterdir()
+    (path,) = entries(kept)
     path.chmod(0o666)
     assert not calculate()[1]
+    # A folder that others could look into is closed to them; one that is theirs is let alone.
     kept.chmod(0o777)
+    assert calculate()[1]
+    assert kept.stat().st_mode & 0o777 == 0o700
+    before = path.read_bytes()
+    monkeypatch.setattr(os, "getuid", lambda: kept.stat().st_uid + 1)
     assert not calculate()[1]
+    assert path.read_bytes() == before
+    monkeypatch.undo()
+
+
+def test_nothing_that_is_read_runs_by_itself():
+    """No module of jaxphoto reads pickles, which may be anybody's."""
+    for path in (ROOT / "jaxphoto").rglob("*.py"):
+        words = set(re.findall(r"\w+", path.read_text()))
+        assert not words & {"unpickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "read_pickle"}, path
+        assert "import pickle" not in path.read_text(), path
+
+
+def test_a_tree_is_told_and_comes_back():
+    tree = {"a": [None, True, 2, 0.1, float("inf"), "x"], "b": (Slot(), jax.tree.map(lambda _: Slot(), Brown()))}
+    again = plain_tree.from_json(json.loads(json.dumps(plain_tree.to_json(tree))))
+    assert [*map(type, again["b"])] == [Slot, Brown]
+    assert again["a"] == tree["a"]
+    assert isinstance(again["b"][1].k1, Slot)
+    assert jax.tree.structure(again) == jax.tree.structure(tree)
+    for unknown in (Own(), object(), {1: 2}, lambda x: x, np.zeros(2), Brown):
+        with pytest.raises(TypeError):
+            plain_tree.to_json(unknown)
+    for name in ("os:system", "jaxphoto:read_block", "jaxphoto.io:read_block", "builtins:list"):
+        with pytest.raises(TypeError):
+            plain_tree.from_json({name: []})
 
 
 @pytest.mark.parametrize("error", [jax.errors.JaxRuntimeError, TypeError])
@@ -144,14 +202,15 @@ def test_what_cannot_be_written_is_compiled(kept, monkeypatch):
 
 def test_what_was_not_used_for_longest_goes_first(kept, monkeypatch):
     calculate(2)
-    (first,) = kept.iterdir()
+    (first,) = entries(kept)
     calculate(3)
-    for path in kept.iterdir():
+    (kept / "tmp123").write_text("half")
+    for path in entries(kept):
         os.utime(path, (1, 1) if path == first else (2, 2))
     assert calculate(2)[1]
     monkeypatch.setattr(store, "MOST", 2.5 * first.stat().st_size)
     calculate(4)
-    assert len(list(kept.iterdir())) == 2
+    assert len(entries(kept)) == 2
     assert calculate(2)[1]
     assert calculate(4)[1]
     assert not calculate(3)[1]

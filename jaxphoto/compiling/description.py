@@ -16,7 +16,7 @@ import numpy as np
 
 from jaxphoto.static_values import StaticArray
 
-# Packages whose sources or versions are part of the key: the name of a function or class of theirs identifies its code.
+# Packages whose sources or versions are part of the key: a name in them identifies its content.
 _KNOWN = frozenset({"jaxphoto", "jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy", "builtins"})
 _PLAIN = (type(None), bool, int, float, complex, str, bytes)
 

@@ -10,8 +10,8 @@ _TRIM_THRESHOLD, _MMAP_THRESHOLD, _MMAP_MAX = -1, -3, -4
 _USUAL_MMAPS = 65_536
 _ALL = 2**31 - 1
 # Maximum size of blocks that reuse freed memory, and maximum amount of freed memory that glibc retains. glibc adapts to
-# these values after it has freed such a block. Until then it may map new work space at each call (for P31: 3.3 MB, a
-# third of the solution time).
+# these values after it has freed such a block. Until then it may map new work space at each call: 3.3 MB and a third of
+# the solution time of P31.
 _LARGEST, _KEPT = 32 * 2**20, 64 * 2**20
 
 

@@ -18,10 +18,11 @@ import jax
 from jaxphoto.compiling import store
 from jaxphoto.compiling.freed_memory import keep_freed_memory, return_freed_memory
 from jaxphoto.compiling.options import options_here
+from jaxphoto.compiling.plain_tree import Slot
 
 
 class _Program(NamedTuple):
-    """Compiled function of arrays, and the tree of its results: leaves that are `store.Slot` are arrays."""
+    """Compiled function of arrays, and the tree of its results: leaves that are `Slot` are arrays."""
 
     compiled: jax.stages.Compiled
     leaves: list
@@ -31,7 +32,7 @@ class _Program(NamedTuple):
     def __call__(self, arrays: list) -> Any:
         """Run the program and wait for the result."""
         found = iter(jax.block_until_ready(self.compiled(*arrays)))
-        leaves = [next(found) if isinstance(leaf, store.Slot) else leaf for leaf in self.leaves]
+        leaves = [next(found) if isinstance(leaf, Slot) else leaf for leaf in self.leaves]
         return jax.tree.unflatten(self.structure, leaves)
 
 
@@ -68,7 +69,7 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
     try:
         result = program(arrays)
     except Exception:
-        # A valid file may still fail on this machine; the call then raises one of various errors.
+        # A valid file may still fail on this machine: this appears only in the call, as various errors.
         if not program.loaded:
             raise
         program = _program_of(function.__wrapped__, arguments, thorough, recompile=True)()
@@ -174,7 +175,7 @@ def _lowered(function: Any, arguments: tuple) -> tuple[jax.stages.Lowered, Any]:
     def flat(*arrays):
         nonlocal skeleton
         result = function(*eqx.combine(jax.tree.unflatten(structure, arrays), static))
-        skeleton = jax.tree.map(lambda leaf: store.Slot() if eqx.is_array(leaf) else leaf, result)
+        skeleton = jax.tree.map(lambda leaf: Slot() if eqx.is_array(leaf) else leaf, result)
         return [leaf for leaf in jax.tree.leaves(result) if eqx.is_array(leaf)]
 
     # Use a different name: JAX's cache must not substitute its entry of `function` (`_not_in_cache`).

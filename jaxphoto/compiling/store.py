@@ -1,28 +1,28 @@
 """Compiled programs on disk, in addition to JAX's own cache; a later process runs them without tracing.
 
 JAX's cache contains the results of XLA's compiler, but requires the traced and lowered program to find them, half of
-the start-up time. Here the file name is a hash of all inputs of a program (`key_of`), the content is written by
-`jax.experimental.serialize_executable`. Like JAX's cache it contains code: only files that nobody but this user can
-write are read.
+the start-up time. Here the file name is a hash of all inputs of a program (`key_of`); the content is JSON and XLA's
+serialised program, in a directory with files of this user only (`private_folder`): like JAX's cache it contains code.
 """
 
 import contextlib
 import functools
 import hashlib
 import importlib.metadata
+import json
 import os
-import pickle
 import platform
 import sys
-import tempfile
 from pathlib import Path
 from typing import Any, NamedTuple
 
 import jax
 import numpy as np
-from jax.experimental.serialize_executable import deserialize_and_load, serialize
 
+from jaxphoto.compiling import private_folder
 from jaxphoto.compiling.description import Indescribable, describe
+from jaxphoto.compiling.plain_program import PlainProgram, as_plain, program_of
+from jaxphoto.compiling.plain_tree import from_json, to_json
 
 with contextlib.suppress(ImportError):  # Other jaxlib version: `load` finds nothing.
     from jaxlib import lapack
@@ -30,11 +30,8 @@ with contextlib.suppress(ImportError):  # Other jaxlib version: `load` finds not
 # Maximum size of the directory in bytes; then the least recently used programs are deleted.
 MOST = 1_000_000_000
 _PACKAGES = ("jax", "jaxlib", "equinox", "optimistix", "lineax", "numpy")
-_DIGEST = hashlib.sha256().digest_size
-
-
-class Slot:
-    """Placeholder for an array in the tree of a result."""
+# Number of bytes of the text length that precedes the text.
+_LENGTH = 8
 
 
 class Stored(NamedTuple):
@@ -71,20 +68,16 @@ def key_of(function: Any, arguments: tuple, options: dict | None) -> str | None:
 def load(key: str) -> Stored | None:
     """Load the program stored under `key`; None if there is none, or it is invalid."""
     folder = _folder()
-    if folder is None or not (folder / key).is_file() or not (_is_private(folder) and _is_private(folder / key)):
+    content = private_folder.read(folder, key) if folder is not None else None
+    if content is None:
         return None
     try:
-        content = (folder / key).read_bytes()
-        if hashlib.sha256(key.encode() + content[_DIGEST:]).digest() != content[:_DIGEST]:
-            return None
-        os.utime(folder / key)
         # A program calls LAPACK by pointers that JAX sets when it lowers such a call; no call is lowered here.
         lapack.prepare_lapack_call("potrf", np.dtype(float))
-        serialised, devices, n, m, skeleton = pickle.loads(content[_DIGEST:])
-        by_id = {device.id: device for device in jax.devices()}
-        trees = jax.tree.structure(((0,) * n, {})), jax.tree.structure([0] * m)
-        compiled = deserialize_and_load(serialised, *trees, execution_devices=[by_id[number] for number in devices])
-        return Stored(compiled, skeleton)
+        length = int.from_bytes(content[:_LENGTH], "big")
+        text = json.loads(content[_LENGTH : _LENGTH + length])
+        compiled = program_of(PlainProgram(text["program"], content[_LENGTH + length :]))
+        return Stored(compiled, from_json(text["skeleton"]))
     except Exception:  # If the file is invalid or JAX has changed, the program is compiled instead.
         return None
 
@@ -95,37 +88,12 @@ def save(key: str, program: Stored) -> None:
     if folder is None:
         return
     try:
-        executable: Any = program.compiled._executable
-        inner = executable._unloaded_executable
-        if inner.host_callbacks or inner.keepalive or inner.ordered_effects or inner.unordered_effects:
-            return
-        serialised, arguments, results = serialize(program.compiled)
-        devices = [int(device.id) for device in inner.device_list]
-        content = pickle.dumps((serialised, devices, arguments.num_leaves, results.num_leaves, program.skeleton))
-        folder.mkdir(mode=0o700, parents=True, exist_ok=True)
-        opened, path = tempfile.mkstemp(dir=folder)
-        with open(opened, "wb") as file:
-            file.write(hashlib.sha256(key.encode() + content).digest() + content)
-        os.replace(path, folder / key)
-        _limit(folder)
+        plain = as_plain(program.compiled)
+        text = json.dumps({"program": plain.text, "skeleton": to_json(program.skeleton)}).encode()
     except Exception:  # JAX and XLA raise various errors for programs that cannot be stored.
         return
-
-
-def _is_private(path: Path) -> bool:
-    """Return True if only this user can write to a file or directory."""
-    found = path.lstat()
-    return not hasattr(os, "getuid") or (found.st_uid == os.getuid() and not found.st_mode & 0o022)
-
-
-def _limit(folder: Path) -> None:
-    """Delete the least recently used files until the rest is below `MOST` bytes."""
-    files = sorted(((path, path.stat()) for path in folder.iterdir()), key=lambda file: file[1].st_mtime)
-    size = sum(found.st_size for _, found in files)
-    for path, found in files:
-        if size > MOST:
-            path.unlink(missing_ok=True)
-            size -= found.st_size
+    private_folder.write(folder, key, len(text).to_bytes(_LENGTH, "big") + text + plain.executable)
+    private_folder.limit(folder, MOST)
 
 
 def _folder() -> Path | None:
@@ -140,7 +108,7 @@ def _settings() -> list[str]:
     """List all settings of JAX, XLA and equinox in this process and around this call; some change the code."""
     kept = ("JAX_", "XLA_", "EQX_")
     chosen = [f"{name}={value}" for name, value in sorted(os.environ.items()) if name.startswith(kept)]
-    # Temporary settings (`with jax.enable_x64(False)`) are visible only as attributes; some options have no attribute.
+    # Temporary settings (`with jax.enable_x64(False)`) are visible as attributes only, and some options are not.
     values = {name: getattr(jax.config, name, value) for name, value in jax.config.values.items()}
     chosen += [f"{name}={value}" for name, value in sorted(values.items())]
     return [line for line in chosen if "cache" not in line.lower().split("=")[0]]

@@ -14,6 +14,7 @@ where the other was observed. Reinstate points that were rejected while blunders
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Huber (1981), Robust statistics.
 """
 
+from collections import Counter
 from collections.abc import Callable, Iterator
 from itertools import combinations
 from typing import NamedTuple
@@ -66,6 +67,8 @@ from jaxphoto.tracing import outside_transformations
 from jaxphoto.unknowns import Unknowns
 
 _MAX_ITERATIONS = 20
+# Maximum number of times the same exchange is tried: other wrong rows of its image may hide it at first.
+_TRIES = 3
 # Maximum sigma0 of a solution that fits; larger values are not explained by weights (docs/trust.md).
 _FITS = 3.0
 # Minimum fraction of image points that remain.
@@ -211,7 +214,7 @@ def _snooped(
     left = {name: flown[name] | worst[name] for name in worst}
     tried: list[RowMasks] = []
     done: list[Exchange] = []
-    tried_exchanges, returned = set[Exchange](), set[int]()
+    tries, returned = Counter[Exchange](), set[int]()
     while True:
         report(f"adjusting without {counted(sum(int(m.sum()) for m in left.values()), 'observation')}")
         adjusted, point, left = solve_without_diverged(block, left, at.unknowns, max_steps, sizes)
@@ -220,12 +223,12 @@ def _snooped(
         lost = np.setdiff1d(np.arange(len(block.points)), point)
         r = predicted_redundancy(at, left, sizes)
         # Coordinates first: wrong ones distort images, so names appear to be exchanged.
-        found = lambda pairs: [e for e in pairs if e not in tried_exchanges and sigma0 <= _FITS]  # noqa: B023, E731
+        found = lambda pairs: [e for e in pairs if tries[e] < _TRIES and sigma0 <= _FITS]  # noqa: B023, E731
         if new := found(_coordinate_exchanges(at, left)) or found(_name_exchanges(at, left, lost, sigma0)):
             for exchange in new:
                 block, left = _exchanged(block, left, exchange)
             done += new
-            tried_exchanges.update(new)
+            tries.update(new)
             # The block has changed: earlier sets of rejections may succeed now.
             tried.clear()
             continue

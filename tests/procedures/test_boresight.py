@@ -266,8 +266,8 @@ def test_the_command_writes_all_four_steps(monkeypatch, capsys, tmp_path):
     assert [s["step"] for s in summary["steps"]] == [1, 2, 3, 4]
     page = (out / "report.html").read_text()
     assert page.index("is usable") < page.index("Step 1")
-    # The verdict in its colour, misalignments and shifts as one picture, links to each step, and how it was made.
-    assert '<p class="verdict green">' in page and page.count("<svg") == 1
+    # The verdict in its colour, misalignments and shifts as pictures, links to each step, and how it was made.
+    assert '<p class="verdict green">' in page and page.count("<svg") == 2
     assert all(f'href="step_{k}/report.html"' in page for k in (1, 2, 3, 4)) and "<th>command</th>" in page
     assert "misalignment of mount one" in screen
     # Earlier results are replaced whole, and exit code 1 says that a step is not passed.
