@@ -1,4 +1,4 @@
-"""The code on docs/exposures.md runs and says what the page is about: a gap, a clock, a solution."""
+"""The code on docs/exposures.md runs and says what the page is about: a gap and a solution."""
 
 import contextlib
 import io
@@ -14,5 +14,5 @@ def test_the_page_runs():
     with contextlib.redirect_stdout(printed):
         exec(compile(code, "exposures.md", "exec"), {"__name__": "page"})
     said, position = printed.getvalue().splitlines()
-    assert "4 of 5 photographs (none for DJI_0003; 1 of its exposures without a photograph, row 5)" in said
-    assert "+2 h (time zone), -18 s (leap seconds" in said and "fix='fixed'" in position
+    assert "4 of 5 photographs" in said and "none for 100_0042_0003" in said
+    assert "fix='fixed'" in position

@@ -1,19 +1,17 @@
 """Limits of what is read: text, JSON, recipes that no computer holds, damaged draws, and lengths of messages."""
 
-import tomllib
-
 import numpy as np
 import pandas as pd
 import pytest
 
 from jaxphoto.errors import BlockError, InputError, quoted, shown
-from jaxphoto.io import read_block, recipe_from
+from jaxphoto.io import read_block
 from jaxphoto.io.draws_folder import DrawsFolder
 from jaxphoto.io.text_files import read_bytes, read_json, read_text
 from jaxphoto.simulation import points
 from jaxphoto.simulation.plans import Footprint, Strip, Swaths
 from tests.io.test_map_block import to_utm
-from tests.simulation.small import RECIPES, changed, made
+from tests.simulation.small import made
 
 
 def test_text_of_any_line_ends(tmp_path):
@@ -55,25 +53,6 @@ def test_height_control_without_columns_of_x_and_y_is_converted(write_folder):
     (before,) = np.asarray(whole.control.value)[(whole.control.who == 1) & (whole.control.axis == 2)]
     origin = np.asarray(whole.frame.origin) - np.asarray(block.frame.origin)
     assert np.abs(origin).max() < 1e-3 and abs(value - before) < 1e-3 and abs(value - 4.0) > 1e-9
-
-
-@pytest.mark.parametrize(
-    ("recipe", "changes"),
-    [
-        ("000", {"points.ties": 10**9}),
-        ("000", {"flight.strips.0.images": 10**9}),
-        ("000", {"flight.strips.0.images": 19_000, "points.ties": 4_000_000}),
-        ("000", {"targets.0.count": 10**12}),
-        ("002", {"targets.0.grid": [100_000, 100_000]}),
-        ("002", {"convergent.stations.0.azimuth_deg": [0.0] * 500, "convergent.stations.0.distance_m": [1.0] * 500}),
-        ("000", {"terrain": {"kind": "random", "count": 10**9, "rms_m": 1.0, "length_m": 1.0}}),
-        ("000", {"terrain": {"buildings": [{"count": 10**9}]}}),
-    ],
-)
-def test_recipes_too_large_for_a_computer_are_refused(recipe, changes):
-    values = changed(changes, tomllib.loads((RECIPES / f"{recipe}.toml").read_text()))
-    with pytest.raises(InputError):
-        recipe_from(values)
 
 
 def test_distant_strips_are_refused():

@@ -24,6 +24,12 @@ from jaxphoto.lidar.strip_planes import StripSettings
 from jaxphoto.procedures.lidar import ScannerPriors, adjust_strips
 from jaxphoto.procedures.lidar.strip_model import _angles, check_measured_from, knot_sigmas, step_rows
 from jaxphoto.report.strips import calibration_table, trajectory_errors_table
+from jaxphoto.rotation import (
+    matrix_from_quaternion,
+    matrix_from_roll_pitch_yaw,
+    quaternion_from_matrix,
+    roll_pitch_yaw_from_matrix,
+)
 from jaxphoto.simulation import Simulation
 from jaxphoto.unknowns import FIXED
 from jaxphoto_command.lidar import scanner_priors

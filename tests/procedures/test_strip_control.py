@@ -261,7 +261,7 @@ def test_control_from_a_file(on_the_map, tmp_path, monkeypatch, capsys):
         ("# EPSG:25833\n", "K1,500000,5000000,3,0.02,0.02,0.02", "is in EPSG:25833"),
         ("", "K1,1,2,,0.02,0.02,0.02", "control.csv, row 2: point K1 has no height"),
         ("", "K1,1,2,3,,,", "control.csv, row 2: point K1 has no standard deviations"),
-        ("", "K1,1,2,3,0.02,0.02,0.02\nK1,1,2,3,0.02,0.02,0.02", "is also in control.csv, row 2"),
+        ("", "K1,1,2,3,0.02,0.02,0.02\nK1,1,2,4,0.02,0.02,0.02", "is also in control.csv, row 2"),
         ("", "K1,1,2,3,0.02,0.02,0.02", "m from the strips"),
     ],
 )

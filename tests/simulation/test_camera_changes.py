@@ -146,7 +146,7 @@ def test_a_photograph_without_a_time_is_named(tmp_path):
         ({"flight.turn_s": -1.0}, r"\[flight\] turn_s"),
         ({"thermal_rates": THERMAL["thermal_rates"]}, "thermal_rates: the recipe has no temperature"),
         ({"camera_walk": {"c_mm": 0.1}}, r"camera_walk: no strip cameras"),
-        (STRIPS | {"camera_walk.c_mm": 0.0}, r"\[camera_walk\]: c, x_p and y_p all have a random walk"),
+        (STRIPS | {"camera_walk.c_mm": 0.0}, r"\[camera_walk\]: give c_mm, xp_mm and yp_mm above zero"),
         (STRIPS | {"strip_cameras.A.truth": {"c_more": "free"}}, r"A\.truth\] c_more: a true value cannot be free"),
         (SPLINE | {"camera_splines.kodak.knots": 7}, r"kodak\.truth\]: knots = 7 is not an even number"),
         (THERMAL | {"temperature.time_constant_s": 0.0}, r"\[temperature\] time_constant_s: 0.0 is not positive"),

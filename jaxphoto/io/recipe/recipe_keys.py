@@ -260,13 +260,15 @@ class StationKeys(Keys):
 
     name: StrictStr
     camera: StrictStr | None = None
-    distance_m: Annotated[OneOrMore, Field()]
+    distance_m: OneOrMore
     azimuth_deg: OneOrMore = [0.0]  # noqa: RUF012
     tilt_deg: OneOrMore
     roll_deg: OneOrMore = [0.0]  # noqa: RUF012
 
     @model_validator(mode="after")
     def _check(self) -> "StationKeys":
+        if min(self.distance_m) <= 0:
+            raise KeyMistake("distance_m", f"{min(self.distance_m):g} is not positive; correct it")
         if min(self.tilt_deg) < 0 or max(self.tilt_deg) >= 90:
             raise KeyMistake("tilt_deg", "tilts must be at least 0 and less than 90 degrees; correct them")
         return self
