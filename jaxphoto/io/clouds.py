@@ -209,7 +209,7 @@ def cloud_system(path: Path, epsg: int | None = None) -> CRS | None:
 
 
 def _with_heights(crs: CRS | None, header: "laspy.LasHeader", name: str) -> CRS | None:
-    """Add the vertical system of the GeoTIFF keys, which laspy does not read. Raises InputError for feet by key only."""
+    """Add the vertical system of the GeoTIFF keys, which laspy does not read. Raises InputError for feet only there."""
     keys = {key.id: key.value_offset for record in header.vlrs.get("GeoKeyDirectoryVlr") for key in record.geo_keys}
     if crs is None or not (crs.is_compound or len(crs.axis_info) == 3):
         if crs is not None and keys.get(_VERTICAL_CRS, 0) in _EPSG_CODES:
