@@ -28,6 +28,8 @@ from jaxphoto.report.plots import (
     plot_residuals_by_radius,
     plot_sigma_map,
     plot_station_residuals,
+    plot_w,
+    plot_w_quantiles,
     prepare_pictures,
 )
 from jaxphoto.report.residual_findings import component_findings, component_tables, left_out_table, snooped_findings
@@ -49,8 +51,8 @@ __all__ = [
     "plot_lidar_heights", "plot_links", "plot_mean_residuals", "plot_models", "plot_overlap",
     "plot_position_offsets", "plot_ray_offsets", "plot_residuals", "plot_residuals_by_radius",
     "plot_scanner_correlation", "plot_sensitivity", "plot_sigma_map", "plot_station_residuals",
-    "plot_strip_differences", "plot_sweep", "plot_trajectory_errors", "prepare_pictures", "print_adjustment",
-    "print_boresight", "print_components", "print_warning", "readable", "recovery_spread", "recovery_table",
-    "report_page", "snooped_findings", "summary_of", "to_latex", "to_markdown", "verdict_of", "write_boresight",
-    "write_results", "write_table", "write_tables",
+    "plot_strip_differences", "plot_sweep", "plot_trajectory_errors", "plot_w", "plot_w_quantiles",
+    "prepare_pictures", "print_adjustment", "print_boresight", "print_components", "print_warning", "readable",
+    "recovery_spread", "recovery_table", "report_page", "snooped_findings", "summary_of", "to_latex", "to_markdown",
+    "verdict_of", "write_boresight", "write_results", "write_table", "write_tables",
 ]  # fmt: skip

@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 import numpy as np
 import pandas as pd
 
-from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import InputError
@@ -42,12 +41,11 @@ from jaxphoto.report.photographs import (
     surveyed_points,
     write_control,
 )
-from jaxphoto.report.plots import axes_or_new, label, plot_links, plot_overlap, title
+from jaxphoto.report.plots import axes_or_new, label, plot_links, title
 from jaxphoto.report.residual_findings import component_findings, component_tables
-from jaxphoto.report.results import adjustment_sections, summary_table, write_results, write_summary
+from jaxphoto.report.results import adjustment_sections, coverage_words, summary_table, write_results, write_summary
 from jaxphoto.report.tables import Tables, with_correlated_sigma
 from jaxphoto.report.verdict import lens_findings, shutter_findings, verdict_of
-from jaxphoto.statistics.block_geometry import Coverage, coverage
 from jaxphoto.writing import InputFile, digest_of_all, whole_folder
 
 if TYPE_CHECKING:
@@ -56,9 +54,6 @@ if TYPE_CHECKING:
 # Maximum number of images in the table on the page; number of images with the largest residuals that a longer table is
 # reduced to; number of images labelled in a plot.
 _MOST, _WORST, _NAMED = 150, 50, 3
-# Minimum numbers of covering images in the table of areas.
-_COVERED_BY = (1, 2, 3, 5, 9)
-_HECTARE = 1e4
 # Probabilities (%) that a normally distributed error is within k standard deviations.
 _WITHIN = ((1, 68.3), (2, 95.4), (3, 99.7))
 
@@ -90,13 +85,6 @@ class PartReport(NamedTuple):
     """Columns: image, n_image_points, rms_px, dX_m to dZ_m (recorded minus adjusted position), position (used, left
     out, none).
     """
-    coverage: Coverage | None
-    """Coverage of the ground; None if the block has no metric scale."""
-
-    @property
-    def unit(self) -> str:
-        """Unit of coordinates: metres, or arbitrary units."""
-        return "units" if self.coverage is None else "m"
 
     @property
     def sigma_factor(self) -> float:
@@ -113,8 +101,7 @@ def report_of(part: FlightPart) -> PartReport:
     tables = Tables(part.adjusted)
     found = [*verdict_of(tables).findings, *(component_findings(part.components) if part.components else [])]
     verdict = Verdict.of([*found, *lens_findings(tables), *_findings(part)])
-    metric = part.placed or part.controlled
-    return PartReport(part, tables, verdict, _images(part), coverage(part.adjusted) if metric else None)
+    return PartReport(part, tables, verdict, _images(part))
 
 
 def _findings(part: FlightPart) -> Iterator[Finding]:
@@ -195,12 +182,12 @@ def flight_page(
     if unused := [(name, why.removeprefix(f"{name}: ")) for name, why in {**spoilt, **left_out}.items()]:
         parts += [Heading("Unused images"), pd.DataFrame(unused, columns=["image", "reason"])]
     first, *others = reports
-    parts += [*coverage_section(first), *positions_section(first, source), *surveyed_section(first)]
+    parts += [*positions_section(first, source), *surveyed_section(first)]
     parts += [Paragraph(as_sentence(s)) for s in (source.camera_from, *first.part.lens) if s]
-    parts += adjustment_sections(first.tables, source.start, first.sigma_factor, first.unit)
+    parts += adjustment_sections(first.tables, source.start, first.sigma_factor)
     parts += [
         Heading("Links between images"),
-        [Plot(partial(plot_links, first.tables, unit=first.unit), "Network of images by common points", 4.4)],
+        [Plot(partial(plot_links, first.tables, unit=first.tables.unit), "Network of images by common points", 4.4)],
     ]
     if first.part.components:
         table = component_tables(first.part.components)["variance_components"]
@@ -229,45 +216,10 @@ def flight_summary(reports: Sequence[PartReport], n_images: int) -> pd.DataFrame
         state = r.part.controlled.state if r.part.controlled else ()
         rows = {"images oriented": f"{len(adjusted.block.images)} of {n_images}"} | summary_table(r.tables)
         del rows["images"]
-        rows |= flight_words(r.coverage, adjusted.block)
         rows["recorded positions"] = f"{len(used)} used, RMS difference {rms} m (X, Y, Z)" if len(used) else "none used"
         rows["surveyed points"] = f"{state.count('control')} control, {state.count('check')} check"
         columns[f"part {number}" if len(reports) > 1 else "value"] = pd.Series(rows)
     return pd.DataFrame(columns).fillna("").reset_index(names="quantity")
-
-
-def flight_words(cover: Coverage | None, block: Block) -> dict[str, str]:
-    """Return map system, height over ground and area. `cover` is None for a block without metric scale."""
-    if cover is None:
-        return {"map system": "none: arbitrary frame and scale"}
-    code = block.frame.code
-    return {
-        "map system": f"EPSG:{code}, adjusted in a local frame" if code else "the local system of the control",
-        "height over ground": f"{np.nanmedian(cover.height_m):.4g} m (median), ground sample distance "
-        f"{100 * np.nanmedian(cover.gsd_m):.3g} cm",
-        "area": f"{cover.area_m2(2) / _HECTARE:.3g} ha covered by two images or more",
-    }
-
-
-def coverage_section(report: PartReport) -> list[Part]:
-    """Return heights, ground sample distances, areas by overlap, and a map of the overlap."""
-    cover = report.coverage
-    if cover is None:
-        return []
-    low, middle, high = np.nanpercentile(cover.height_m, [0, 50, 100])
-    gsd = 100 * np.nanpercentile(cover.gsd_m, [0, 50, 100])
-    words = (
-        f"Height over ground {middle:.4g} m (median; {low:.4g} to {high:.4g} m), ground sample distance {gsd[1]:.3g} "
-        f"cm ({gsd[0]:.3g} to {gsd[2]:.3g} cm)."
-    )
-    areas = [(f"{n} or more", f"{cover.area_m2(n) / _HECTARE:.3g}") for n in _COVERED_BY]
-    alt = f"Overlap: number of images per place of the ground, at most {cover.seen_by.max()}"
-    return [
-        Heading("Coverage and overlap"),
-        Paragraph(words),
-        pd.DataFrame(areas, columns=["images per place", "area [ha]"]),
-        [Plot(partial(plot_overlap, report.tables), alt, 4.2)],
-    ]
 
 
 def positions_section(report: PartReport, source: FlightSource) -> Iterator[Part]:
@@ -384,7 +336,8 @@ def images_section(reports: Sequence[PartReport]) -> Iterator[Part]:
     yield Heading("All images")
     tables = []
     for number, r in enumerate(reports, 1):
-        height, gsd = (r.coverage.height_m, 100 * r.coverage.gsd_m) if r.coverage else (np.nan, np.nan)
+        cover = r.tables.coverage
+        height, gsd = (cover.height_m, 100 * cover.gsd_m) if cover else (np.nan, np.nan)
         tables.append(r.images.assign(height_m=height, gsd_cm=gsd, part=number))
     table = pd.concat(tables, ignore_index=True)
     if len(table) > _MOST:
@@ -431,7 +384,7 @@ def write_flight(
     for folder_name, r in zip(folders, reports, strict=True):
         times = {name: r.part.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(work / folder_name) as folder:
-            entries = {"sigma_factor": r.sigma_factor, "flight": flight_words(r.coverage, r.part.adjusted.block)}
+            entries = {"sigma_factor": r.sigma_factor, "flight": coverage_words(r.tables)}
             write_results(r.tables, r.verdict, folder, times, {**source.entries, **entries})
             correlated = with_correlated_sigma(r.tables.interior, r.part.adjusted, r.part.oriented.report.alike)
             correlated.to_csv(folder / "interior_correlated.csv", index=False)

@@ -9,6 +9,7 @@ import io
 from collections.abc import Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
+import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -28,6 +29,8 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = ("tab:blue", "tab:orange", "tab:green")
+# Number of points of a Q-Q plot between the tails.
+_QUANTILES = 400
 _MARKS = ("o", "s", "^")
 _BARS = 2.0
 """Length of error bars in standard deviations."""
@@ -231,6 +234,34 @@ def plot_residuals_by_radius(tables: Tables, camera: str | None = None, ax: Axes
     ax.axhline(0, color="0.6", lw=0.6)
     ax.set(xlabel="distance from the principal point [mm]", ylabel="mean residual [µm]")
     ax.legend(fontsize=7)
+    return ax
+
+
+def plot_w(tables: Tables, ax: Axes | None = None) -> Axes:
+    """Draw the histogram of the normalised residuals w and the standard normal density."""
+    ax, w = axes_or_new(ax), tables.w_values
+    grid = np.linspace(-4.0, 4.0, 161)
+    beyond = (np.abs(w) > grid[-1]).sum()
+    ax.hist(np.clip(w, grid[0], grid[-1]), bins=40, range=(grid[0], grid[-1]), density=True, color="0.75")
+    ax.plot(grid, np.exp(-(grid**2) / 2) / np.sqrt(2 * np.pi), color="tab:blue", label="standard normal")
+    ax.set(xlabel="w", ylabel="density")
+    ax.legend(fontsize=7)
+    title(ax, f"normalised residuals: {len(w)}, {beyond} beyond 4")
+    return ax
+
+
+def plot_w_quantiles(tables: Tables, ax: Axes | None = None) -> Axes:
+    """Draw the normalised residuals w against the quantiles of the standard normal distribution."""
+    ax, w = axes_or_new(ax), np.sort(tables.w_values)
+    expected = np.asarray(jax.scipy.stats.norm.ppf((np.arange(len(w)) + 0.5) / max(len(w), 1)))
+    # All of the tails; of the middle so many that the curve is closed.
+    middle = np.linspace(0, len(w) - 1, min(len(w), _QUANTILES)).astype(int)
+    shown = np.union1d(middle, np.flatnonzero(abs(expected) > 2))
+    ax.plot(expected[shown], w[shown], ".", ms=3)
+    limit = float(abs(expected).max(initial=1.0))
+    ax.plot([-limit, limit], [-limit, limit], color="0.6", lw=0.8)
+    ax.set(xlabel="standard normal quantile", ylabel="w")
+    title(ax, "Q-Q plot of normalised residuals")
     return ax
 
 

@@ -3,6 +3,7 @@
 import itertools
 import json
 import math
+import re
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from functools import partial
@@ -45,6 +46,7 @@ from jaxphoto.report.page import (
 from jaxphoto.report.tables import Tables, check_spread, recovery_spread, side_by_side, with_correlated_sigma
 from jaxphoto.statistics import LEAST_CHECKED, LEVEL, global_test
 from jaxphoto.statistics.block_geometry import format_coverage
+from jaxphoto.unknowns import Weighted
 from jaxphoto.writing import whole_folder
 
 _TABLES = (
@@ -63,6 +65,8 @@ _EFFECTS = {"pattern": "systematic effect", "freedom": "degrees of freedom", "sh
 # Classes in the table of object points: minimum number of rays of each class.
 _RAYS = (2, 3, 4, 6, 11, 21)
 _SMALL_DEG = 2.0
+# Square metres; numbers of covering images in the summary.
+_HECTARE, _COVERED_BY = 1e4, (1, 2, 5)
 
 
 # Files -----------------------------------------------------------------------------------------------------------
@@ -193,9 +197,12 @@ def _global_test(tables: Tables) -> dict[str, Any]:
 def report_page(tables: Tables, verdict: Verdict, record: CommandRecord | None = None) -> str:
     """Return the report as HTML: verdict, summary, at most three findings, then all sections."""
     block = tables.adjusted.block
-    parts: list[Part] = [summary_table(tables), *verdict_parts(verdict)[:_TOP]]
+    parts: list[Part] = [*verdict_parts(verdict)[:_TOP], summary_table(tables)]
     if len(verdict.findings) > _TOP:
-        parts += [Heading("All findings"), *verdict_parts(verdict)]
+        table = verdict.table.iloc[_TOP:]
+        fact = [text.removesuffix(f". {hint}") for text, hint in zip(table["text"], table["hint"], strict=True)]
+        columns = ["severity", "code", "subject", "value", "limit", "finding", "hint"]
+        parts += [Heading("Further findings"), without_empty(table.assign(finding=fact)[columns])]
     parts += adjustment_sections(tables)
     if record:
         parts += provenance(record)
@@ -212,8 +219,7 @@ def summary_table(tables: Tables) -> dict[str, str]:
         "images": str(len(block.images)),
         "object points": f"{len(block.points)}, {len(a.structure.image)} image points, {rays:.1f} rays per point",
     }
-    if (height := flying_height(a)) is not None:
-        rows["flying height"] = f"{height[0]:.4g} m (median), ground sample distance {100 * height[1]:.3g} cm"
+    rows |= coverage_words(tables)
     for name, interior in list(a.unknowns.interior.items())[:_PLOTTED]:
         sensor = block.sensors[name]
         rows[camera_words(name)] = (
@@ -242,29 +248,39 @@ def summary_table(tables: Tables) -> dict[str, str]:
     return rows
 
 
-def flying_height(adjusted: Adjustment) -> tuple[float, float] | None:
-    """Return the median height above the observed points, and the ground sample distance (m).
-
-    Returns None unless images are near-vertical and the scale is metric.
-    """
-    block, s = adjusted.block, adjusted.structure
-    known = len(block.stations.who) + len(block.control.who) + len(block.fixed.who)
-    if not known or not len(s.image):
-        return None
-    exterior, points = adjusted.unknowns.exterior, np.asarray(adjusted.unknowns.points)
-    away = points[s.point] - np.asarray(exterior.position)[s.image]
-    depth = -np.einsum("nk,nk->n", np.asarray(exterior.camera_from_object)[s.image][:, 2], away)
-    scale = {c: block.sensors[c].pixel_mm / float(i.c) for c, i in adjusted.unknowns.interior.items()}
-    height = float(np.median(-away[:, 2]))
-    if height < 0.7 * np.median(depth):
-        return None
-    return height, float(np.median(depth * np.array([scale[c] for c in block.image_camera])[s.image]))
+def coverage_words(tables: Tables) -> dict[str, str]:
+    """Return coordinate system, and for near-vertical images height over ground, ground sample distance and area."""
+    frame, cover = tables.adjusted.block.frame, tables.coverage
+    system = {"epsg": f"EPSG:{frame.code}, adjusted in a local frame"}.get(frame.kind, f"{frame.kind} frame, in metres")
+    rows = {"coordinate system": system if tables.unit == "m" else "arbitrary frame and scale"}
+    if cover is not None:
+        low, middle, high = np.nanpercentile(cover.height_m, [0, 50, 100])
+        gsd = 100 * np.nanpercentile(cover.gsd_m, [0, 50, 100])
+        rows["height over ground"] = f"{middle:.4g} m (median; {low:.4g} to {high:.4g} m)"
+        rows["ground sample distance"] = f"{gsd[1]:.3g} cm (median; {gsd[0]:.3g} to {gsd[2]:.3g} cm)"
+        areas = [f"{cover.area_m2(n) / _HECTARE:.3g} ha by {n} images or more" for n in _COVERED_BY]
+        rows["area covered"] = ", ".join(areas)
+    return rows
 
 
 def adjustment_sections(
-    tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0, unit: str = "m"
+    tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0
 ) -> Iterator[Part]:
-    """Yield all sections of an adjustment. `start`: initial camera; `factor`: factor of its standard deviations."""
+    """Yield all sections of an adjustment. `start`: initial camera; `factor`: factor of its standard deviations.
+
+    Without scale, columns in metres have the unit `Tables.unit`.
+    """
+    for part in _sections(tables, start, factor):
+        if isinstance(part, pd.DataFrame) and tables.unit != "m":
+            yield part.rename(columns=lambda name: re.sub(r"_m$", f" [{tables.unit}]", str(name))).replace(
+                {"unit": {"m": tables.unit}}
+            )
+        else:
+            yield part
+
+
+def _sections(tables: Tables, start: InteriorOrientation | None, factor: float) -> Iterator[Part]:
+    unit = tables.unit
     a, cameras = tables.adjusted, plotted_cameras(tables)
     mapped = [camera for camera in tables.sigma_maps if camera in cameras]
     yield from _interior(tables, cameras, start, factor)
@@ -284,12 +300,14 @@ def adjustment_sections(
             "(sigma_map.csv). At infinity the error in c propagates fully; at the object distance it is partly "
             "compensated by the camera position."
         )
-        for one in (one for camera in mapped for one in tables.sigma_maps[camera]):
-            sensor, worst = a.block.sensors[one.camera], one.worst[np.isfinite(one.worst)]
-            px = worst / sensor.pixel_mm
-            spread = f"median {np.median(px):.2g} px, worst {px.max():.2g} px" if len(px) else "unknown"
-            words = f"{camera_words(one.camera)}: sigma {plots.distance_words(one.distance_m)}, {spread}"
-            yield [Plot(partial(plots.draw_sigma_map, sensor=sensor, one=one), words)]
+        for camera in mapped:
+            maps, sensor = [], a.block.sensors[camera]
+            for one in tables.sigma_maps[camera]:
+                px = one.worst[np.isfinite(one.worst)] / sensor.pixel_mm
+                spread = f"median {np.median(px):.2g} px, worst {px.max():.2g} px" if len(px) else "unknown"
+                words = f"{camera_words(camera)}: sigma {plots.distance_words(one.distance_m)}, {spread}"
+                maps.append(Plot(partial(plots.draw_sigma_map, sensor=sensor, one=one), words))
+            yield maps
     if tables.truth:
         yield Heading("Recovery of the true values")
         yield Paragraph(
@@ -301,7 +319,12 @@ def adjustment_sections(
     if len(tables.georeferencing):
         yield from (Heading("Mounts and strips"), tables.georeferencing)
     yield Heading("Block")
-    yield [Plot(partial(plot_block, a), block_words(a.block), 4.2)]
+    layout = [Plot(partial(plot_block, a), block_words(a.block), 4.2)]
+    if tables.coverage is not None:
+        layout.append(
+            Plot(partial(plots.plot_overlap, tables), "overlap: number of images per cell of the ground", 4.2)
+        )
+    yield layout
     yield from _residuals(tables, cameras)
     yield from points_section(tables, unit)
     yield from _check_points(tables)
@@ -339,9 +362,13 @@ def interior_table(tables: Tables, start: InteriorOrientation | None = None, fac
     for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
         name, pixel, estimated = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma"] > 0
         correlated, in_mm = p["sigma_correlated"], estimated and name.endswith("_mm")
+        first = start or tables.adjusted.block.start.unknowns.interior[p["camera"]]
+        priors = tables.adjusted.priors.interior[p["camera"]]
+        prior = get_parameter(priors, name) if name in parameter_names(priors) else None
         rows.append({
             "camera": p["camera"], "parameter": name,
-            "initial": f"{float(get_parameter(start, name)):.6g}" if start and name in parameter_names(start) else "",
+            "initial": f"{float(get_parameter(first, name)):.6g}" if name in parameter_names(first) else "",
+            "prior sigma": of_sigma(float(prior.sigma)) if isinstance(prior, Weighted) else "",
             "value": with_sigma(p["value"], p["sigma"]), "sigma": of_sigma(p["sigma"]) if estimated else "fixed",
             "sigma (correlated residuals)": of_sigma(correlated) if estimated and factor > 1 else "",
             "unit": p["unit"], "in pixels": plus_minus(p["value"] / pixel, correlated / pixel) if in_mm else "",
@@ -393,6 +420,13 @@ def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
         yield [Plot(partial(plot, tables, camera), f"{name}, {words}", 3.8) for name, plot in panels.items()]
     if len(tables.adjusted.block.stations.who):
         yield [Plot(partial(plots.plot_station_residuals, tables), "residuals of stations in order of time")]
+    if tables.w_values.size:
+        yield Paragraph(
+            "Normalised residuals w: residual over its standard deviation. Without blunders and with true weights "
+            "they are standard normal."
+        )
+        yield [Plot(partial(plot, tables), f"{name} of normalised residuals")
+               for name, plot in (("histogram", plots.plot_w), ("Q-Q plot", plots.plot_w_quantiles))]  # fmt: skip
     if len(tables.trends):
         yield Paragraph("Systematic residuals, by image format, time and strip:")
         yield without_empty(readable(tables.trends)).rename(columns=_EFFECTS)
@@ -434,9 +468,11 @@ def _check_points(tables: Tables) -> Iterator[Part]:
     control = tables.residuals[tables.residuals["group"] == "control_points"]
     if len(control):
         yield Heading("Control points")
-        yield Paragraph("Residuals (m): surveyed minus adjusted.")
+        yield Paragraph("Surveyed minus adjusted (m), and the standard deviations of the adjusted coordinates.")
         wide = control.astype({"axis": str, "point": str}).pivot_table("residual", "point", "axis", sort=False)
-        yield wide.rename(columns="d{}_m".format).assign(total_m=np.sqrt((wide**2).sum(axis=1))).reset_index()
+        wide = wide.rename(columns="d{}_m".format).assign(total_m=np.sqrt((wide**2).sum(axis=1)))
+        sigma = tables.object_points.set_index("point")[[f"sigma_{axis}_m" for axis in AXES]]
+        yield wide.join(sigma.set_axis(sigma.index.astype(str))).reset_index()
     if len(tables.check_points):
         yield Heading("Check points: surveyed minus computed")
         yield check_spread(tables.check_points)

@@ -22,11 +22,14 @@ from jaxphoto.parameters import unit_of
 from jaxphoto.report.findings import symbol
 from jaxphoto.report.formatting import in_file_unit, label_unit
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
-from jaxphoto.statistics.block_geometry import intersection_angles
+from jaxphoto.statistics.block_geometry import Coverage, coverage, intersection_angles
 from jaxphoto.statistics.correlation import FORMS
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
 from jaxphoto.tracing import refuse_traced
 from jaxphoto.unknowns import Weighted
+
+# Median cosine of the tilt above which images are near-vertical (45 degrees).
+_NEAR_VERTICAL = 0.7
 
 
 class Tables:
@@ -75,6 +78,21 @@ class Tables:
         return np.where(bool(self.adjusted.converged), np.asarray(sigma), np.nan)
 
     @cached_property
+    def unit(self) -> str:
+        """Unit of object coordinates: "m", or "units" if no observation determines the scale of the block."""
+        block = self.adjusted.block
+        scaled = (block.stations, block.control, block.fixed, block.distances)
+        return "m" if block.more or any(len(rows.sigma) for rows in scaled) else "units"
+
+    @cached_property
+    def coverage(self) -> Coverage | None:
+        """Coverage of the ground; None without scale, or unless the images are near-vertical."""
+        if self.unit != "m" or not len(self.adjusted.structure.image):
+            return None
+        cover, down = coverage(self.adjusted), np.asarray(self.adjusted.unknowns.exterior.camera_from_object)[:, 2, 2]
+        return cover if np.median(down) > _NEAR_VERTICAL else None
+
+    @cached_property
     def redundancy(self) -> statistics.Redundancy:
         """Redundancy number of every observation."""
         return statistics.redundancy_numbers(self.adjusted, self.covariance)
@@ -83,6 +101,12 @@ class Tables:
     def w(self) -> Residuals:
         """Normalised residual of every observation."""
         return statistics.normalised_residuals(self.adjusted, self.redundancy)
+
+    @cached_property
+    def w_values(self) -> Float[np.ndarray, "n"]:
+        """Normalised residuals of all checked observations."""
+        checked = self.residuals["redundancy_number"] > statistics.LEAST_CHECKED
+        return self.residuals["w"][checked].dropna().to_numpy()
 
     @cached_property
     def blunders(self) -> statistics.BlunderTest:

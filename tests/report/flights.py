@@ -15,7 +15,6 @@ from jaxphoto.procedures.orientation import Oriented
 from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport
 from jaxphoto.report.findings import Finding, Verdict
 from jaxphoto.report.flight import FlightSource, PartReport
-from jaxphoto.statistics.block_geometry import coverage
 from jaxphoto.writing import InputFile
 from tests.blocks import BROWN, adjusted
 
@@ -46,7 +45,7 @@ def part_report() -> PartReport:
     images = pd.DataFrame({"image": block.images, "n_image_points": np.bincount(found.structure.image, minlength=n)})
     images = images.assign(rms_px=np.linspace(0.3, 1.2, n), dX_m=d[:, 0], dY_m=d[:, 1], dZ_m=d[:, 2])
     images = images.assign(position=["used"] * 3 + ["left out"] + ["none"] * (n - 4))
-    return PartReport(part, Tables(found), VERDICT, images, coverage(found))
+    return PartReport(part, Tables(found), VERDICT, images)
 
 
 def source() -> FlightSource:
