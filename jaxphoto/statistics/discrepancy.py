@@ -127,6 +127,6 @@ class AxisErrors(NamedTuple):
     def biased(self) -> bool:
         """True if the mean exceeds both the limit of the ASPRS standard and the limit of Student's t."""
         if self.n < 2 or abs(self.mean_m) <= SUSPECT_MEAN * self.rmse_m:
-            return bool(False)
+            return False
         scatter = math.sqrt(max(self.rmse_m**2 - self.mean_m**2, 0.0) / (self.n - 1))
-        return abs(self.mean_m) > student_limit(self.n - 1, _LEVEL) * scatter
+        return bool(abs(self.mean_m) > student_limit(self.n - 1, _LEVEL) * scatter)
