@@ -59,6 +59,7 @@ def test_calibrates_and_writes_everything(folder, monkeypatch, capsys, tmp_path)
     assert float(block.start.unknowns.interior["camera"].distortion.r0) == 0.0
 
 
+@pytest.mark.slow
 def test_two_calibrations_are_compared(folder, monkeypatch, capsys, tmp_path):
     """The same photographs under names with brackets and dollars, with another R0, and no size of a pixel given."""
     named = [tmp_path / f"[x]{k}$a$ #1 [bold].png" for k in range(IMAGES)]

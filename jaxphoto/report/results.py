@@ -153,7 +153,7 @@ def summary_of(tables: Tables, verdict: Verdict, seconds: dict[str, float]) -> d
         "georeferencing": {p: {"value": v, "sigma": s} for p, v, s in tables.georeferencing.itertuples(index=False)},
         "check_points": {
             axis: {"n": int(n), "mean_m": mean, "rmse_m": rmse, "max_abs_m": most}
-            for axis, n, mean, rmse, most, _ in check_spread(tables.check_points).itertuples(index=False)
+            for axis, n, mean, rmse, most, *_ in check_spread(tables.check_points).itertuples(index=False)
             if n
         },
         "seconds": rounded(seconds),
@@ -249,14 +249,14 @@ def summary_table(tables: Tables) -> dict[str, str]:
 
 
 def coverage_words(tables: Tables) -> dict[str, str]:
-    """Return coordinate system, and for near-vertical images height over ground, ground sample distance and area."""
+    """Return coordinate system, and for near-vertical images flying height, ground sample distance and area."""
     frame, cover = tables.adjusted.block.frame, tables.coverage
     system = {"epsg": f"EPSG:{frame.code}, adjusted in a local frame"}.get(frame.kind, f"{frame.kind} frame, in metres")
     rows = {"coordinate system": system if tables.unit == "m" else "arbitrary frame and scale"}
     if cover is not None:
         low, middle, high = np.nanpercentile(cover.height_m, [0, 50, 100])
         gsd = 100 * np.nanpercentile(cover.gsd_m, [0, 50, 100])
-        rows["height over ground"] = f"{middle:.4g} m (median; {low:.4g} to {high:.4g} m)"
+        rows["flying height"] = f"{middle:.4g} m (median; {low:.4g} to {high:.4g} m)"
         rows["ground sample distance"] = f"{gsd[1]:.3g} cm (median; {gsd[0]:.3g} to {gsd[2]:.3g} cm)"
         areas = [f"{cover.area_m2(n) / _HECTARE:.3g} ha by {n} images or more" for n in _COVERED_BY]
         rows["area covered"] = ", ".join(areas)

@@ -444,10 +444,12 @@ def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
 
 
 def check_spread(check: pd.DataFrame) -> pd.DataFrame:
-    """Tabulate the discrepancies at check points: axis, n, mean, rmse, max_abs, unit."""
-    values = check[[f"d{axis}_m" for axis in AXES]].set_axis(AXES, axis=1)
+    """Tabulate the discrepancies at check points: axis, n, mean, rmse, max_abs, point (of the largest), unit."""
+    values = check.set_index("point")[[f"d{axis}_m" for axis in AXES]].set_axis(AXES, axis=1)
     spread = {"mean": values.mean(), "rmse": np.sqrt((values**2).mean()), "max_abs": values.abs().max()}
-    return pd.DataFrame({"n": values.count(), **spread}).reset_index(names="axis").assign(unit="m")
+    largest = [v.abs().idxmax() if v.notna().any() else "" for _, v in values.items()]
+    table = pd.DataFrame({"n": values.count(), **spread, "point": largest})
+    return table.reset_index(names="axis").assign(unit="m")
 
 
 def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) -> pd.DataFrame:

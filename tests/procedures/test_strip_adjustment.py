@@ -105,6 +105,7 @@ def test_scanner_parameters_are_recovered():
     assert len(table) == 5 and (table.value.abs() > 4 * table.sigma).sum() >= 4
 
 
+@pytest.mark.slow
 def test_a_risley_scanner_is_calibrated_by_its_two_looks():
     flight = flown_around()
     found = adjust_strips(flight.cloud, flight.trajectory, SETTINGS, PRIORS_AROUND)
@@ -178,6 +179,7 @@ MOST = 1000
 COARSE = StripSettings(cell_m=2.0, roughness_m=0.04, returns=8, most=MOST)
 
 
+@pytest.mark.slow
 def test_without_a_trajectory_shifts_are_estimated():
     shift = np.array([0.15, -0.2, 0.1])
     found = adjust_strips(two_strips(shift), settings=COARSE)

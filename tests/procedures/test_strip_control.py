@@ -112,6 +112,7 @@ def test_one_strip_is_fitted_to_control():
     assert 0.6 < np.sqrt(np.mean(used.w**2)) < 1.4 and not told.w.isna().any()
 
 
+@pytest.mark.slow
 def test_on_level_ground_control_determines_heights_only():
     # No more than two points, which would not do for photographs.
     xy = np.array([[42.0, 50.0], [58.0, 50.0]])
@@ -233,6 +234,7 @@ def on_the_map(tmp_path_factory):
     return folder, frame
 
 
+@pytest.mark.slow
 def test_control_from_a_file(on_the_map, tmp_path, monkeypatch, capsys):
     folder, frame = on_the_map
     control, out = surveyed(on_roofs(24, 3), 3), tmp_path / "out"

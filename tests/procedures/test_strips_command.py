@@ -97,6 +97,7 @@ def test_shifts_are_taken_off_the_cloud(cloud_file, tmp_path, monkeypatch, capsy
     }  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_trajectory_is_mended_with_the_cloud(cloud_file, tmp_path, monkeypatch, capsys):
     """The second strip's shift is one of its trajectory; the first is held."""
     time = np.concatenate([start + np.arange(-1.0, 4.0, 0.1) for start in (0.0, 10.0)])
@@ -139,6 +140,7 @@ def on_the_map(cloud_file, tmp_path_factory):
     return folder, frame
 
 
+@pytest.mark.slow
 def test_a_cloud_on_the_map_and_a_trajectory_in_sbet(on_the_map, tmp_path, monkeypatch, capsys):
     folder, frame = on_the_map
     given = ("--trajectory", folder / "flight.sbet", "--adjust", "none", "--hold", "1", "--sigma-position-m", "0.3")

@@ -40,7 +40,7 @@ def test_a_pyramid_opens_towards_the_points_of_its_image(tables):
 
 def test_a_report_opens_with_verdict_and_summary_and_is_self_contained(tables, report):
     body = report[report.index("<body>") :]
-    order = [body.index(text) for text in ('class="verdict', "flying height", 'class="note"', "<nav>", "<h2")]
+    order = [body.index(text) for text in ('class="verdict', 'class="note"', "flying height", "<nav>", "<h2")]
     assert order == sorted(order)
     assert not re.search(r'<(img|script|link)[^>]*(src|href)="(?!data:)', report)
     links = re.findall(r'<a href="#([^"]+)">', body)

@@ -79,6 +79,7 @@ def test_a_mirrored_image_is_an_error(block):
     assert_mirrored(snoop(spoilt), spoilt, "A3")
 
 
+@pytest.mark.slow
 def test_an_image_that_is_mirrored_is_an_alarm(block):
     """Collinearity holds behind a camera, too: from below nothing but one station would contradict it."""
     rows = block.image_points
