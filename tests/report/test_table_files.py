@@ -148,7 +148,11 @@ def test_what_has_no_sigma_of_its_name_is_neither_cut_nor_endless():
 def test_check_points_are_summed_up_by_axis():
     d = pd.DataFrame({"point": ["a", "b"], "dX_m": [0.01, -0.03], "dY_m": [0.02, 0.02], "dZ_m": [0.0, np.nan]})
     spread = check_spread(d)
-    assert list(spread["axis"]) == ["X", "Y", "Z"] and list(spread["n"]) == [2, 2, 1] and list(spread["point"]) == ["b", "a", "a"]
+    assert (
+        list(spread["axis"]) == ["X", "Y", "Z"]
+        and list(spread["n"]) == [2, 2, 1]
+        and list(spread["point"]) == ["b", "a", "a"]
+    )
     np.testing.assert_allclose(spread[["mean", "rmse", "max_abs"]], [[-0.01, 5e-4**0.5, 0.03], [0.02] * 3, [0.0] * 3])
 
 
