@@ -69,7 +69,7 @@ def test_what_cannot_be_measured_is_told_in_a_sentence(tmp_path):
     with pytest.raises(InputError, match="not a readable image"):
         sift_features(tmp_path / "text.png", SENSOR)
     cv2.imwrite(str(tmp_path / "blank.png"), np.full((480, 640), 90, np.uint8))
-    with pytest.raises(InputError, match="the picture has 640 x 480 pixels, the camera 320 x 240"):
+    with pytest.raises(InputError, match="640 x 480 pixels, the camera 320 x 240"):
         sift_features(tmp_path / "blank.png", Sensor(320, 240, 0.006))
 
 
