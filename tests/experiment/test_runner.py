@@ -206,7 +206,7 @@ def test_what_is_no_experiment_is_refused(files, message, tmp_path):
     ("text", "message"),
     [
         ("table,row,column\n", "the column published is missing"),
-        (PUBLISHED + "iops,1,c_mm,34.25,mm,0.1,\n", "c_mm occurs twice"),
+        (PUBLISHED + "iops,1,c_mm,34.25,mm,0.1,\n", "c_mm is printed twice"),
     ],
 )
 def test_published_tables_that_cannot_be_are_refused(text, message, run, tmp_path):

@@ -55,7 +55,7 @@ def test_folders_in_a_folder_and_raw_files_are_told(folder, tmp_path):
     with pytest.raises(InputError, match=r"none is a readable photograph$"):
         valid_photographs([card])
     (folder / "0.jpg").rename(card / "100MEDIA" / "0.jpg")
-    with pytest.raises(InputError, match=r"100MEDIA: 1 picture in a folder that is not named"):
+    with pytest.raises(InputError, match=r"100MEDIA: 1 photograph in a subfolder"):
         valid_photographs([card])
     inner = card / "100MEDIA"
     said = {str(inner): f"{inner}: 1 photograph in a subfolder that is not read; add this folder"}
