@@ -200,7 +200,7 @@ def test_a_delay_goes_through_files_and_needs_the_motion(tmp_path):
         adjust(dataclasses.replace(late().block, motion=None))
     bare = indirect(late().block)
     assert bare.motion is not None and not len(bare.stations)
-    with pytest.raises(BlockError, match="needs the motion of image A_01, which stations"):
+    with pytest.raises(BlockError, match="needs the motion of image A_01, which is stored in stations"):
         write_block(bare, tmp_path / "bare")
     assert indirect(flown().block).motion is None
 
