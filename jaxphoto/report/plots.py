@@ -7,9 +7,9 @@ from __future__ import annotations
 
 import io
 from collections.abc import Mapping, Sequence
+from statistics import NormalDist
 from typing import TYPE_CHECKING, Any
 
-import jax
 import numpy as np
 from jaxtyping import Float
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLOURS = ("tab:blue", "tab:orange", "tab:green")
-# Number of points of a Q-Q plot between the tails.
+# Maximum number of points of a Q-Q plot.
 _QUANTILES = 400
 _MARKS = ("o", "s", "^")
 _BARS = 2.0
@@ -253,12 +253,13 @@ def plot_w(tables: Tables, ax: Axes | None = None) -> Axes:
 def plot_w_quantiles(tables: Tables, ax: Axes | None = None) -> Axes:
     """Draw the normalised residuals w against the quantiles of the standard normal distribution."""
     ax, w = axes_or_new(ax), np.sort(tables.w_values)
-    expected = np.asarray(jax.scipy.stats.norm.ppf((np.arange(len(w)) + 0.5) / max(len(w), 1)))
-    # All of the tails; of the middle so many that the curve is closed.
-    middle = np.linspace(0, len(w) - 1, min(len(w), _QUANTILES)).astype(int)
-    shown = np.union1d(middle, np.flatnonzero(abs(expected) > 2))
-    ax.plot(expected[shown], w[shown], ".", ms=3)
-    limit = float(abs(expected).max(initial=1.0))
+    n, normal = len(w), NormalDist()
+    # Rows at equal distances along the axis: all of the tails, of the middle as many as a curve needs.
+    limit = -normal.inv_cdf(0.5 / max(n, 1))
+    ranks = [n * normal.cdf(z) for z in np.linspace(-limit, limit, _QUANTILES)]
+    shown = np.unique(np.clip(np.array(ranks, int), 0, n - 1)) if n else np.zeros(0, int)
+    expected = np.array([normal.inv_cdf((k + 0.5) / n) for k in shown])
+    ax.plot(expected, w[shown], ".", ms=3)
     ax.plot([-limit, limit], [-limit, limit], color="0.6", lw=0.8)
     ax.set(xlabel="standard normal quantile", ylabel="w")
     title(ax, "Q-Q plot of normalised residuals")

@@ -258,7 +258,7 @@ def coverage_words(tables: Tables) -> dict[str, str]:
         gsd = 100 * np.nanpercentile(cover.gsd_m, [0, 50, 100])
         rows["flying height"] = f"{middle:.4g} m (median; {low:.4g} to {high:.4g} m)"
         rows["ground sample distance"] = f"{gsd[1]:.3g} cm (median; {gsd[0]:.3g} to {gsd[2]:.3g} cm)"
-        areas = [f"{cover.area_m2(n) / _HECTARE:.3g} ha by {n} images or more" for n in _COVERED_BY]
+        areas = [f"{cover.area_m2(n) / _HECTARE:.3g} ha by {counted(n, 'image')} or more" for n in _COVERED_BY]
         rows["area covered"] = ", ".join(areas)
     return rows
 
@@ -372,7 +372,8 @@ def interior_table(tables: Tables, start: InteriorOrientation | None = None, fac
             "value": with_sigma(p["value"], p["sigma"]), "sigma": of_sigma(p["sigma"]) if estimated else "fixed",
             "sigma (correlated residuals)": of_sigma(correlated) if estimated and factor > 1 else "",
             "unit": p["unit"], "in pixels": plus_minus(p["value"] / pixel, correlated / pixel) if in_mm else "",
-            "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
+            # Significance is a difference from zero, which c never is.
+            "significant": {True: "yes", False: "no"}.get(p["significant"], "") if name != "c_mm" else "",
         })  # fmt: skip
     shown = without_empty(pd.DataFrame(rows))
     return shown if len(tables.adjusted.unknowns.interior) > 1 else shown.drop(columns="camera")

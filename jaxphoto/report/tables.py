@@ -160,16 +160,13 @@ class Tables:
 
     @cached_property
     def interior(self) -> pd.DataFrame:
-        """Interior orientation: camera, parameter, value, sigma (NaN if fixed or not converged), significant, unit.
-
-        `significant` refers to a difference from zero; it is empty for c, which is never zero.
-        """
+        """Interior orientation: camera, parameter, value, sigma (NaN if fixed or not converged), significant, unit."""
         tests = {(s.camera, s.parameter): s for s in self.significance}
         rows = []
         for camera, interior in self.adjusted.unknowns.interior.items():
             for name in (*parameter_names(interior), *constant_names(interior)):
                 test = tests.get((camera, name))
-                tested = (test.sigma, None if name == "c_mm" else test.significant) if test else (np.nan, None)
+                tested = (test.sigma, test.significant) if test else (np.nan, None)
                 value = float(get_parameter(interior, name))
                 rows.append((camera, name, value, *tested, parameter_unit(interior, name)))
         return pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma", "significant", "unit"])

@@ -47,8 +47,11 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
         f"sigma0 {float(adjusted.sigma0):.6g}   redundancy {adjusted.redundancy} = {n} observations{constraints} - {u} "
         "unknowns"
     )
+    interior = tables.interior[tables.interior["sigma"].notna()]
+    # Significance is a difference from zero, which c never is.
+    interior = interior.assign(significant=interior["significant"].where(interior["parameter"] != "c_mm", None))
     shown = {
-        "interior orientation (a posteriori)": tables.interior[tables.interior["sigma"].notna()],
+        "interior orientation (a posteriori)": interior,
         "mounts and strips (a posteriori)": tables.georeferencing.head(_PARAMETERS),
         "residuals": tables.residual_spread.drop(columns="mean"),
         "check points": check_spread(tables.check_points) if len(tables.check_points) else tables.check_points,
