@@ -13,7 +13,7 @@ import nox
 
 nox.needs_version = ">=2025.2.9"
 nox.options.default_venv_backend = "uv"
-# Each process that compiles all modules anew takes 5 s more, and the tests start hundreds.
+# Each process that recompiles all modules takes 5 s more, and the tests start hundreds.
 os.environ["UV_COMPILE_BYTECODE"] = "1"
 os.environ.pop("PYTHONDONTWRITEBYTECODE", None)
 # A Python that is not on this machine is reported as skipped.

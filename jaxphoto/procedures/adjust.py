@@ -266,11 +266,6 @@ def start_of(block: Block, report: Callable[[str], object] = lambda text: None) 
     return approximate(oriented)
 
 
-def needs_orientation(block: Block) -> bool:
-    """Return True if resection and intersection do not reach all images, or only with large misclosures."""
-    return not _reached(block)[1]
-
-
 def _reached(block: Block) -> tuple[Block, bool]:
     """Complete the approximate values by resection and intersection; also return True if they are sufficient."""
     reached = dataclasses.replace(block, start=completed(block))

@@ -187,7 +187,7 @@ def flight_page(
     parts += adjustment_sections(first.tables, source.start, first.sigma_factor)
     parts += [
         Heading("Links between images"),
-        [Plot(partial(plot_links, first.tables, unit=first.tables.unit), "Network of images by common points", 4.4)],
+        [Plot(partial(plot_links, first.tables), "Network of images by common points", 4.4)],
     ]
     if first.part.components:
         table = component_tables(first.part.components)["variance_components"]

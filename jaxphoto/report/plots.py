@@ -13,7 +13,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from jaxtyping import Float
 
-from jaxphoto.adjustment import Adjustment
 from jaxphoto.block_edits import one_camera
 from jaxphoto.camera import Sensor, parameter_names
 from jaxphoto.errors import InputError, camera_words, printable
@@ -21,7 +20,7 @@ from jaxphoto.observations import AXES
 from jaxphoto.report.findings import symbol
 from jaxphoto.report.tables import Tables
 from jaxphoto.stability import NORMAL_95, DistortionCurve, distortion_curve
-from jaxphoto.statistics.block_geometry import Coverage, coverage, image_links
+from jaxphoto.statistics.block_geometry import coverage, image_links
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_map
 
 if TYPE_CHECKING:
@@ -239,7 +238,7 @@ def plot_residuals_by_radius(tables: Tables, camera: str | None = None, ax: Axes
 
 def plot_w(tables: Tables, ax: Axes | None = None) -> Axes:
     """Draw the histogram of the normalised residuals w and the standard normal density."""
-    ax, w = axes_or_new(ax), tables.w_values
+    ax, w = axes_or_new(ax), tables.checked_w.to_numpy()
     grid = np.linspace(-4.0, 4.0, 161)
     beyond = (np.abs(w) > grid[-1]).sum()
     ax.hist(np.clip(w, grid[0], grid[-1]), bins=40, range=(grid[0], grid[-1]), density=True, color="0.75")
@@ -252,7 +251,7 @@ def plot_w(tables: Tables, ax: Axes | None = None) -> Axes:
 
 def plot_w_quantiles(tables: Tables, ax: Axes | None = None) -> Axes:
     """Draw the normalised residuals w against the quantiles of the standard normal distribution."""
-    ax, w = axes_or_new(ax), np.sort(tables.w_values)
+    ax, w = axes_or_new(ax), np.sort(tables.checked_w.to_numpy())
     n, normal = len(w), NormalDist()
     # Rows at equal distances along the axis: all of the tails, of the middle as many as a curve needs.
     limit = -normal.inv_cdf(0.5 / max(n, 1))
@@ -443,11 +442,12 @@ def ellipse_axes(
     return a, b, np.arctan2(axes[:, 1, 1], axes[:, 0, 1])
 
 
-def plot_error_ellipses(tables: Tables, ax: Axes | None = None, *, unit: str = "m") -> Axes:
+def plot_error_ellipses(tables: Tables, ax: Axes | None = None) -> Axes:
     """Draw enlarged standard ellipses (39 % probability) of the projection centres in plan; colour: sigma of Z."""
     from matplotlib.collections import EllipseCollection
 
     ax, covariance = axes_or_new(ax), tables.covariance.positions * float(tables.covariance.variance_factor)
+    unit = tables.unit
     at = np.asarray(tables.adjusted.unknowns.exterior.position)
     ax.plot(*at[:, :2].T, "+", ms=4, color="0.4")
     name = "error ellipses of projection centres"
@@ -484,28 +484,23 @@ def plot_intersection_angles(tables: Tables, ax: Axes | None = None) -> Axes:
 
 def plot_overlap(tables: Tables, ax: Axes | None = None) -> Axes:
     """Draw the number of images that cover each cell of the ground; coordinates in metres."""
-    ax = axes_or_new(ax)
-    draw_overlap(ax, coverage(tables.adjusted), tables.adjusted)
-    return ax
-
-
-def draw_overlap(ax: Axes, cover: Coverage, adjusted: Adjustment) -> None:
-    """Draw the number of images per cell, and the stations."""
+    ax, cover = axes_or_new(ax), tables.coverage or coverage(tables.adjusted)
     counts = np.ma.masked_less(cover.seen_by, 1)
     x, y = (np.append(v - cover.step_m / 2, v[-1] + cover.step_m / 2) for v in (cover.x, cover.y))
     shown = ax.pcolormesh(x, y, counts, cmap="viridis", rasterized=True)
     ax.figure.colorbar(shown, ax=ax, label="images", shrink=0.8)
-    station = np.asarray(adjusted.unknowns.exterior.position)
+    station = np.asarray(tables.adjusted.unknowns.exterior.position)
     ax.plot(station[:, 0], station[:, 1], "w+", ms=5, mew=0.8)
     ax.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
     title(ax, "overlap: images per cell of the ground")
+    return ax
 
 
-def plot_links(tables: Tables, ax: Axes | None = None, *, unit: str = "m") -> Axes:
+def plot_links(tables: Tables, ax: Axes | None = None) -> Axes:
     """Draw the image network in plan: pairs of images with common points, strong links on top."""
     from matplotlib.collections import LineCollection
 
-    ax, links = axes_or_new(ax), image_links(tables.adjusted)
+    ax, links, unit = axes_or_new(ax), image_links(tables.adjusted), tables.unit
     station, order = np.asarray(tables.adjusted.unknowns.exterior.position)[:, :2], np.argsort(links.common)
     ends = np.stack([station[links.first], station[links.second]], axis=1)[order]
     drawn = LineCollection(list(ends), array=links.common[order], cmap="cividis_r", lw=0.8, rasterized=len(ends) > 2000)

@@ -43,8 +43,15 @@ from jaxphoto.report.page import (
     verdict_parts,
     versions,
 )
-from jaxphoto.report.tables import Tables, check_spread, recovery_spread, side_by_side, with_correlated_sigma
-from jaxphoto.statistics import LEAST_CHECKED, LEVEL, global_test
+from jaxphoto.report.tables import (
+    Tables,
+    check_spread,
+    recovery_spread,
+    shown_interior,
+    side_by_side,
+    with_correlated_sigma,
+)
+from jaxphoto.statistics import LEVEL, global_test
 from jaxphoto.statistics.block_geometry import format_coverage
 from jaxphoto.unknowns import Weighted
 from jaxphoto.writing import whole_folder
@@ -280,7 +287,6 @@ def adjustment_sections(
 
 
 def _sections(tables: Tables, start: InteriorOrientation | None, factor: float) -> Iterator[Part]:
-    unit = tables.unit
     a, cameras = tables.adjusted, plotted_cameras(tables)
     mapped = [camera for camera in tables.sigma_maps if camera in cameras]
     yield from _interior(tables, cameras, start, factor)
@@ -326,10 +332,10 @@ def _sections(tables: Tables, start: InteriorOrientation | None, factor: float) 
         )
     yield layout
     yield from _residuals(tables, cameras)
-    yield from points_section(tables, unit)
+    yield from points_section(tables)
     yield from _check_points(tables)
     yield Heading("Exterior orientation")
-    yield [Plot(partial(plots.plot_error_ellipses, tables, unit=unit), "error ellipses of projection centres", 4)]
+    yield [Plot(partial(plots.plot_error_ellipses, tables), "error ellipses of projection centres", 4)]
     yield tables.exterior
     if len(summary := tables.correlation_summary):
         yield Heading("Correlation of exterior and interior orientation over the images")
@@ -357,7 +363,7 @@ def plotted_cameras(tables: Tables) -> list[str]:
 
 def interior_table(tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0) -> pd.DataFrame:
     """Tabulate interior parameters: initial values, estimates, sigmas (times `factor`), in pixels, significance."""
-    table = with_correlated_sigma(tables.interior, tables.adjusted, factor)
+    table = with_correlated_sigma(shown_interior(tables), tables.adjusted, factor)
     rows = []
     for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
         name, pixel, estimated = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma"] > 0
@@ -372,8 +378,7 @@ def interior_table(tables: Tables, start: InteriorOrientation | None = None, fac
             "value": with_sigma(p["value"], p["sigma"]), "sigma": of_sigma(p["sigma"]) if estimated else "fixed",
             "sigma (correlated residuals)": of_sigma(correlated) if estimated and factor > 1 else "",
             "unit": p["unit"], "in pixels": plus_minus(p["value"] / pixel, correlated / pixel) if in_mm else "",
-            # Significance is a difference from zero, which c never is.
-            "significant": {True: "yes", False: "no"}.get(p["significant"], "") if name != "c_mm" else "",
+            "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
         })  # fmt: skip
     shown = without_empty(pd.DataFrame(rows))
     return shown if len(tables.adjusted.unknowns.interior) > 1 else shown.drop(columns="camera")
@@ -421,7 +426,7 @@ def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
         yield [Plot(partial(plot, tables, camera), f"{name}, {words}", 3.8) for name, plot in panels.items()]
     if len(tables.adjusted.block.stations.who):
         yield [Plot(partial(plots.plot_station_residuals, tables), "residuals of stations in order of time")]
-    if tables.w_values.size:
+    if len(tables.checked_w):
         yield Paragraph(
             "Normalised residuals w: residual over its standard deviation. Without blunders and with true weights "
             "they are standard normal."
@@ -431,8 +436,7 @@ def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
     if len(tables.trends):
         yield Paragraph("Systematic residuals, by image format, time and strip:")
         yield without_empty(readable(tables.trends)).rename(columns=_EFFECTS)
-    checked = tables.residuals["redundancy_number"] > LEAST_CHECKED
-    largest = tables.residuals.loc[tables.residuals["w"].abs()[checked].nlargest(_LARGEST).index]
+    largest = tables.residuals.loc[tables.checked_w.abs().nlargest(_LARGEST).index]
     yield Paragraph(
         "Largest normalised residuals. r is the redundancy number, MDB the minimal detectable bias (power 80 %); the "
         "last columns are its external reliability: by how many sigmas a bias of one MDB moves an estimate."
@@ -440,7 +444,7 @@ def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
     yield readable(largest).rename(columns=_RELIABILITY)
 
 
-def points_section(tables: Tables, unit: str = "m") -> Iterator[Part]:
+def points_section(tables: Tables) -> Iterator[Part]:
     """Yield rays, intersection angles and standard deviations of the measured object points."""
     table = tables.object_points
     table = table[table["n_images"] > 0]
@@ -453,7 +457,7 @@ def points_section(tables: Tables, unit: str = "m") -> Iterator[Part]:
     for name, of in [*table.groupby(rays.rename("rays"), observed=True), ("all", table)]:
         row = {"rays": name, "points": len(of), "fraction": f"{100 * len(of) / len(table):.1f} %"}
         row["median angle [deg]"] = f"{of['angle_deg'].median():.1f}"
-        row |= {f"median sigma {axis} [{unit}]": of_sigma(of[f"sigma_{axis}_m"].median()) for axis in AXES}
+        row |= {f"median sigma {axis} [{tables.unit}]": of_sigma(of[f"sigma_{axis}_m"].median()) for axis in AXES}
         rows.append(row)
     small = int((table["angle_deg"] < _SMALL_DEG).sum())
     yield Heading("Object points")

@@ -103,10 +103,10 @@ class Tables:
         return statistics.normalised_residuals(self.adjusted, self.redundancy)
 
     @cached_property
-    def w_values(self) -> Float[np.ndarray, "n"]:
-        """Normalised residuals of all checked observations."""
+    def checked_w(self) -> pd.Series:
+        """Normalised residuals of all checked observations, by row of `residuals`."""
         checked = self.residuals["redundancy_number"] > statistics.LEAST_CHECKED
-        return self.residuals["w"][checked].dropna().to_numpy()
+        return self.residuals["w"][checked].dropna()
 
     @cached_property
     def blunders(self) -> statistics.BlunderTest:
@@ -441,6 +441,12 @@ def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
         "bent": np.where(history.bent > 0, history.bent, np.nan), "taken": np.where(history.accepted > 0, "yes", "no"),
     }  # fmt: skip
     return pd.DataFrame({name: pd.Series(values) for name, values in columns.items()}).fillna({"taken": ""})
+
+
+def shown_interior(tables: Tables) -> pd.DataFrame:
+    """Return `Tables.interior` for display: no significance of c, which is a difference from zero."""
+    table = tables.interior
+    return table.assign(significant=table["significant"].where(table["parameter"] != "c_mm", None))
 
 
 def check_spread(check: pd.DataFrame) -> pd.DataFrame:

@@ -8,7 +8,7 @@ from jaxphoto.errors import counted, printable
 from jaxphoto.report.findings import MARKS, Verdict
 from jaxphoto.report.formatting import to_rich
 from jaxphoto.report.residual_findings import component_tables
-from jaxphoto.report.tables import Tables, check_spread, recovery_spread
+from jaxphoto.report.tables import Tables, check_spread, recovery_spread, shown_interior
 from jaxphoto.statistics import VarianceComponents
 
 _FINDINGS, _PARAMETERS = 12, 18
@@ -47,11 +47,8 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
         f"sigma0 {float(adjusted.sigma0):.6g}   redundancy {adjusted.redundancy} = {n} observations{constraints} - {u} "
         "unknowns"
     )
-    interior = tables.interior[tables.interior["sigma"].notna()]
-    # Significance is a difference from zero, which c never is.
-    interior = interior.assign(significant=interior["significant"].where(interior["parameter"] != "c_mm", None))
     shown = {
-        "interior orientation (a posteriori)": interior,
+        "interior orientation (a posteriori)": shown_interior(tables)[tables.interior["sigma"].notna()],
         "mounts and strips (a posteriori)": tables.georeferencing.head(_PARAMETERS),
         "residuals": tables.residual_spread.drop(columns="mean"),
         "check points": check_spread(tables.check_points) if len(tables.check_points) else tables.check_points,

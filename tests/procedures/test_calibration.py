@@ -157,9 +157,9 @@ def test_views_of_one_row_do_not_spoil_the_start():
         for some in (detections, row, beside)
     )
     start, _ = flat_start(pairs, SENSOR, 8.0)
-    spoilt, told = flat_start(pairs + rows + more, SENSOR, 8.0)
-    assert told
-    assert float(spoilt.c) == pytest.approx(float(start.c), rel=1e-9)
+    again, message = flat_start(pairs + rows + more, SENSOR, 8.0)
+    assert message
+    assert float(again.c) == pytest.approx(float(start.c), rel=1e-9)
     assert not flat_start(rows + more, SENSOR, 8.0)[1]
 
 

@@ -10,7 +10,7 @@ from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import BlockError
 from jaxphoto.initial.approximate import completed
 from jaxphoto.observations import CameraPositions, ControlCoordinates, ImagePoints
-from jaxphoto.procedures.adjust import adjust, needs_orientation, start_of
+from jaxphoto.procedures.adjust import _reached, adjust, start_of
 from jaxphoto.procedures.orientation import orient_block
 from jaxphoto.procedures.orientation.orient_photographs import freed
 from tests.formulas import camera_from_object
@@ -19,6 +19,11 @@ from tests.procedures.orientable import Camera, aerial, block_of, convergent, ph
 pytest.importorskip("pycolmap", reason="pycolmap, which orients images, is not installed (extra photos)")
 
 PLAIN = Camera(8.0, 0.0, 0.0, 0.0, 0.0)
+
+
+def needs_orientation(block):
+    """Resection and intersection do not suffice."""
+    return not _reached(block)[1]
 
 
 def unknown_block(scene, held=True):
