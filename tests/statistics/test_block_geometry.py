@@ -8,7 +8,8 @@ import pytest
 from matplotlib.figure import Figure
 from scipy.spatial import Delaunay
 
-from jaxphoto.report.plots import draw_overlap
+from jaxphoto.report import Tables
+from jaxphoto.report.plots import plot_overlap
 from jaxphoto.statistics.block_geometry import (
     Coverage,
     coverage,
@@ -35,7 +36,9 @@ def test_a_map_of_one_row_is_drawn_as_wide_as_its_cells():
     a = adjusted("cross")
     result = coverage(a)
     axes = Figure().subplots()
-    draw_overlap(axes, result._replace(y=result.y[:1], seen_by=result.seen_by[:1]), a)
+    tables = Tables(a)
+    tables.coverage = result._replace(y=result.y[:1], seen_by=result.seen_by[:1])
+    plot_overlap(tables, axes)
     box = axes.collections[0].get_datalim(axes.transData)
     assert box.height == pytest.approx(result.step_m) and box.width == pytest.approx(len(result.x) * result.step_m)
 
