@@ -24,7 +24,6 @@ _BIASES = Literal[
 # Biases whose standard deviation is in degrees; option of the standard deviation by unit.
 _DEGREES = ("attitude", "trajectory-attitude", "boresight")
 _SIGMA_OPTIONS = {"m": "--sigma-m", "deg": "--sigma-deg", "mm": "--sigma-mm", "own": "--sigma"}
-_SHOWN = 12
 
 
 @command(
@@ -210,8 +209,7 @@ def monte_carlo(
     from jaxphoto.io import read_block
     from jaxphoto.io.draws_folder import check_place
     from jaxphoto.procedures.adjust import adjust
-    from jaxphoto.report.draws import LONG, write_draws_page
-    from jaxphoto.report.formatting import readable
+    from jaxphoto.report.draws import print_draws, write_draws_page
     from jaxphoto.sensitivity import Readjustment, bias, check_draws, noise
 
     check_draws(draws)
@@ -228,7 +226,7 @@ def monte_carlo(
         drawn = noise(read) if kind == "noise" else bias(read, kind, sigmas, per, of=on or [], parameter=parameter)
         progress.update("adjusting the nominal block")
         adjusted = adjust(read)
-        progress.update("compiling")
+        progress.update("preparing the draws")
         drawn_sigmas = np.broadcast_to(drawn.sigma, (draws, len(drawn.sigma)))
         kept = {name: name in (keep or ()) for name in ("exterior", "points")}
         run = Readjustment(adjusted, drawn.applied, drawn_sigmas, **kept)
@@ -238,14 +236,7 @@ def monte_carlo(
         progress.update(f"writing {out}")
         summary, table = study.write()
         write_draws_page(summary, table, read.sensors, out, record)
-    output.say(
-        f"{summary['draws']} draws, {summary['converged']} converged, {summary['fallbacks']} by a full adjustment; "
-        f"{summary['draws_per_second']:.0f} draws per second"
-    )
-    rows = table[~table["quantity"].astype(str).str.startswith(("bias.", *LONG))]
-    columns = ["quantity", "unit", "nominal", "mean", "sd", "predicted_sigma", "ratio"]
-    headings = "quantity", "unit", "nominal", "mean", "sd", "predicted sigma", "ratio"
-    output.table("estimates over the draws", headings, readable(rows[columns]).itertuples(index=False))
+    print_draws(summary, table, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
 
 
@@ -280,8 +271,7 @@ def sensitivity(
     """Compute exact effects of station errors on interior orientation and check points, and external reliability."""
     from jaxphoto.io import read_block
     from jaxphoto.procedures.adjust import adjust_for_tables
-    from jaxphoto.report.formatting import in_figures
-    from jaxphoto.report.sensitivity import SensitivityTables, write_sensitivity
+    from jaxphoto.report.sensitivity import SensitivityTables, print_sensitivity, write_sensitivity
     from jaxphoto.writing import check_folder
 
     if bias_m == 0 or not math.isfinite(bias_m):
@@ -295,24 +285,11 @@ def sensitivity(
         adjusted = adjust_for_tables(read, max_steps, progress.update)
         progress.update("differentiating")
         results = SensitivityTables(adjusted, per, bias_m, delta0)
-        largest = results.largest
         progress.update(f"writing {out}")
         order = ("compile", "solve", "covariance", "sensitivity")
         write_sensitivity(results, out, seconds | {name: adjusted.seconds[name] for name in order}, record)
     warn_of_contradictions(adjusted, output)
-    columns = ["estimate", "estimate_unit", "exact", "over_sigma", "first_order", "unit", "axis"]
-    headings = "estimate", "exact", "in sigmas", "first-order", "by stations of"
-    rows = (
-        (
-            str(estimate),
-            f"{in_figures(float(exact), 3)} {unit}".removesuffix(" 1"),
-            f"{ratio:.2f}",
-            f"{in_figures(float(first), 3)} {unit}".removesuffix(" 1"),
-            f"{group} in {axis}",
-        )
-        for estimate, unit, exact, ratio, first, group, axis in largest[columns].head(_SHOWN).itertuples(index=False)
-    )
-    output.table(f"largest changes by a station bias of {bias_m:g} m per {per}", headings, rows)
+    print_sensitivity(results, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
 
 
@@ -339,7 +316,7 @@ def halves(
     from jaxphoto.io import read_block
     from jaxphoto.procedures.compare import camera_of
     from jaxphoto.procedures.compare import halves as compare_halves
-    from jaxphoto.report.stability import halves_verdict, write_halves
+    from jaxphoto.report.stability import print_halves, write_halves
     from jaxphoto.writing import check_folder
 
     check_folder(out, block)
@@ -359,7 +336,7 @@ def halves(
 
         write_halves(result, out, write_camera, record)
     warn_of_contradictions(result.adjusted, output)
-    output.say(*halves_verdict(result))
+    print_halves(result, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
 
 

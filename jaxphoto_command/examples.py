@@ -1,5 +1,6 @@
 """Commands that write examples, simulate blocks and run experiments."""
 
+import math
 from pathlib import Path
 from typing import Annotated
 
@@ -108,6 +109,7 @@ def experiment(
 ) -> None:
     """Run experiments; write tables.csv and report.html with the published values."""
     from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, write_runs
+    from jaxphoto.experiment.page import agreement, far_apart, not_judged
     from jaxphoto.writing import check_folder
 
     folders = find_experiments(experiments, name)
@@ -119,17 +121,25 @@ def experiment(
             runs[folder] = run_experiment(declaration, folder, layouts, progress.update)
         # Write after each experiment, so that results remain if a later one fails.
         write_runs(runs, out, record)
-        judged = compare(runs[folder], folder)
-        groups = list(judged.groupby("table", sort=False))
-        rows = []
-        for table, cells in groups:
-            judged_cells, outside = cells[cells["within"] != ""], cells[cells["within"] == "no"]
-            listed = "; ".join(f"{r.row} {r.column} ({r.ours:.4g}, {r.published:.4g})" for r in outside.itertuples())
-            rows.append((str(table), str((cells["within"] == "yes").sum()), str(len(judged_cells)), listed))
-        output.table(declaration.title, ("table", "within", "of", "outside (ours, published)"), iter(rows))
-        counts = {row[0]: (int(row[1]), int(row[2])) for row in rows if row[2] != "0"}
-        within, total = ({table: pair[k] for table, pair in counts.items()} for k in (0, 1))
-        output.add(**{folder.name: {"within": within, "of": total}})
+        comparison = compare(runs[folder], folder)
+        output.say(declaration.title, agreement(comparison))
+        rows, counts = list[tuple[str, ...]](), dict[str, tuple[int, int]]()
+        for of_table, cells in comparison.groupby("table", sort=False):
+            within, of = int((cells["within"] == "yes").sum()), int((cells["within"] != "").sum())
+            counts |= {str(of_table): (within, of)} if of else {}
+            unjudged, far = int(not_judged(cells)["values"].sum()), far_apart(cells)
+            outside = [f"{r.row} {r.column} ({r.ours:.4g}, {r.published:.4g})"
+                       for r in cells[cells["within"] == "no"].itertuples()]  # fmt: skip
+            ratios = [
+                f"{r['row']} {r['column']} ({r['ours']:.3g}, {r['published']:.3g}: x {r['ratio']:.2g}"
+                + ("" if math.isnan(r["expected"]) else f", expected {r['expected']:.3g}") + ")"
+                for r in far.to_dict("records")
+            ]  # fmt: skip
+            rows.append((str(of_table), str(within), str(of), str(unjudged), "; ".join([*outside, *ratios])))
+        headings = "table", "within", "judged", "not judged", "outside; twice or half without tolerance (ours, printed)"
+        output.table("values within tolerance", headings, iter(rows))
+        within_of, total = ({table: pair[k] for table, pair in counts.items()} for k in (0, 1))
+        output.add(**{folder.name: {"within": within_of, "of": total}})
         for failure in runs[folder].failures:
             output.warn(f"skipped: {failure}")
     output.wrote(out, f"results in {out} (open report.html)")

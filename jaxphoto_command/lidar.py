@@ -67,7 +67,7 @@ def lidar_control(
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.procedures.lidar import lidar_control
     from jaxphoto.procedures.lidar.vertical_control import flag_counts
-    from jaxphoto.report.lidar import heights_page, heights_table, rounds_table, rounds_words
+    from jaxphoto.report.lidar import heights_page, heights_table, print_control, rounds_table
     from jaxphoto.writing import check_folder
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
@@ -83,7 +83,7 @@ def lidar_control(
             heights.to_csv(folder / "lidar_heights.csv", index=False)
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
             (folder / "report.html").write_text(page, encoding="utf-8")
-    output.say(*rounds_words(result.rounds, result.converged))
+    print_control(result, output.screen)
     rejected = flag_counts(result.flag[~np.isfinite(result.height)]).items()
     note = f" (rejected: {', '.join(f'{name.lower()} {n}' for name, n in rejected)})" if rejected else ""
     used = int(result.used.sum())
@@ -110,7 +110,7 @@ def roof_control(
     from jaxphoto.io import write_block
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.procedures.lidar import roof_control
-    from jaxphoto.report.lidar import rounds_words
+    from jaxphoto.report.lidar import print_control
     from jaxphoto.writing import check_folder
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=0.0)
@@ -121,7 +121,7 @@ def roof_control(
         result = roof_control(read, points, settings, centroids=opt.names(centroids), **options)
         progress.update(f"writing {out}")
         write_block(result.block, out)
-    output.say(*rounds_words(result.rounds, result.converged))
+    print_control(result, output.screen)
     output.wrote(out, f"wrote {out}: {len(result.points)} tie points lie on {result.faces} roof faces")
     output.add(n_tie_points=len(result.points), n_roof_faces=result.faces)
     _end_of_rounds(output, result)
@@ -166,8 +166,9 @@ def simultaneous(
     from jaxphoto.lidar import HeightSettings
     from jaxphoto.lidar.correction import correct_cloud, scanner_path
     from jaxphoto.procedures.lidar import simultaneous
-    from jaxphoto.report.formatting import to_rich
-    from jaxphoto.report.lidar import moved_table, rounds_words, write_simultaneous
+    from jaxphoto.report.lidar import print_simultaneous, write_simultaneous
+    from jaxphoto.report.tables import Tables
+    from jaxphoto.report.verdict import verdict_of
     from jaxphoto.writing import check_folder
 
     settings = HeightSettings(sigma_z_m=sigma_z_m, sigma_xy_m=sigma_xy_m, sigma_systematic_m=sigma_systematic_m)
@@ -193,16 +194,17 @@ def simultaneous(
         result = simultaneous(read, surface, path, priors, **options)
         progress.update(f"writing {out}")
         track = None if path is None else scanner_path(path)
-        with write_simultaneous(result, out, seconds, output.command_record(block, cloud, trajectory)) as folder:
+        tables, record = Tables(result.adjusted), output.command_record(block, cloud, trajectory)
+        verdict = verdict_of(tables)
+        with write_simultaneous(result, tables, verdict, out, seconds, record) as folder:
             strips = tuple(result.scanner.shifts)
             corrected = lambda part: correct_cloud(part, result.scanner, track).xyz  # noqa: E731
             write_corrected(cloud, folder, corrected, strips, path, read.frame, cloud_epsg)
             if trajectory is not None and records is not None and result.trajectory is not None:
                 moved = with_positions(records, np.asarray(result.trajectory.position), read.frame)
                 write_moved(moved._replace(time=moved.time + trajectory_shift_s), trajectory, folder)
-    output.say(*rounds_words(result.rounds, result.converged))
-    output.screen.print(to_rich(moved_table(result), "changes"))
-    output.wrote(out, f"results in {out}")
+    print_simultaneous(result, tables, verdict, output.screen)
+    output.wrote(out, f"results in {out} (open report.html)")
     if not result.converged:
         raise typer.Exit(1)
 
@@ -275,7 +277,6 @@ def strips(
     from jaxphoto.procedures.lidar.iterate_to_convergence import at_result
     from jaxphoto.report.strips import print_strips, strips_verdict, write_strips
     from jaxphoto.report.tables import Tables
-    from jaxphoto.report.terminal import print_verdict
     from jaxphoto.writing import check_folder
 
     sigmas = {
@@ -341,8 +342,7 @@ def strips(
         gaps = strip_differences(measured, settings), strip_differences(result.cloud, settings)
         record = output.command_record(cloud, trajectory, block, control)
         write_strips(result, tables, verdict, gaps, out, write_files, record)
-    print_verdict(verdict, output.screen)
-    print_strips(result, output.screen)
+    print_strips(result, verdict, output.screen)
     output.wrote(out, f"results in {out} (open report.html)")
     if verdict.severity == "error":
         raise typer.Exit(1)

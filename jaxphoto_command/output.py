@@ -20,7 +20,10 @@ COMPILE_NOTE_S = 2.0
 """Minimum total compile time (s) that is reported at the end."""
 # Minimum compile time (s) of a program that is logged.
 _COMPILE_LOG_S = 0.1
+# Name of the records of JAX: a scalar at the start of a compilation, and its duration at the end.
 _COMPILED = "/jax/core/compile/backend_compile_duration"
+# Note on a compilation in progress, and the time (s) after which it is shown.
+_COMPILING, _NOTICEABLE_S = "; compiling (first run of this kind, cached afterwards)", 0.5
 _FLAGS = ("json", "quiet", "verbose")
 _LOG = logging.getLogger("jaxphoto")
 
@@ -62,6 +65,7 @@ class Output:
         """Console of the results."""
         self._start, self._warnings, self._files = time.perf_counter(), list[str](), list[str]()
         self._summary, self._compile_s = dict[str, Any](), defaultdict[str, float](float)
+        self._compilations = list[float]()
         self._log = logging.StreamHandler() if verbose else None
 
     def __enter__(self) -> "Output":
@@ -76,12 +80,14 @@ class Output:
             _LOG.setLevel(logging.INFO)
         import jax.monitoring
 
+        jax.monitoring.register_scalar_listener(self._compiling)
         jax.monitoring.register_event_duration_secs_listener(self._compiled)
         return self
 
     def __exit__(self, kind: type | None, error: BaseException | None, traceback: object) -> None:
         import jax.monitoring
 
+        jax.monitoring.unregister_scalar_listener(self._compiling)
         jax.monitoring.unregister_event_duration_listener(self._compiled)
         warnings.showwarning = self._showwarning
         if self._log:
@@ -95,13 +101,24 @@ class Output:
         """Display progress of a long operation on standard error."""
         from rich import progress
         from rich.console import Console
+        from rich.text import Text
+
+        class Description(progress.ProgressColumn):
+            def render(column, task: progress.Task) -> Text:
+                return Text(task.description + (_COMPILING if self._is_compiling else ""))
+
+        class Remaining(progress.TimeRemainingColumn):
+            """Remaining time of steps of equal cost; empty while a program is compiled."""
+
+            def render(column, task: progress.Task) -> Text:
+                return super().render(task) if task.total is not None and not self._is_compiling else Text()
 
         columns = (
             progress.SpinnerColumn(),
-            progress.TextColumn("{task.description}", markup=False),
+            Description(),
             progress.BarColumn(),
             progress.TimeElapsedColumn(),
-            progress.TimeRemainingColumn(),
+            Remaining(),
         )
         console = Console(stderr=True)
         hidden = self._quiet or self._log is not None or not console.is_terminal
@@ -180,10 +197,22 @@ class Output:
             }
         }
 
+    @property
+    def _is_compiling(self) -> bool:
+        """True if a program has been compiled for a noticeable time."""
+        return any(time.perf_counter() - start > _NOTICEABLE_S for start in tuple(self._compilations))
+
+    def _compiling(self, event: str, value: float, **tags: Any) -> None:
+        if event == _COMPILED:
+            self._compilations.append(time.perf_counter())
+
     def _compiled(self, event: str, duration_secs: float, **tags: Any) -> None:
         if event == _COMPILED:
             name = str(tags.get("fun_name", "")).removeprefix("jit(").removesuffix(")").removesuffix("_of_arrays")
             self._compile_s[name] += duration_secs
+            # Programs may be compiled in parallel: the start of the oldest remains.
+            if self._compilations:
+                self._compilations.pop()
             if duration_secs >= _COMPILE_LOG_S:
                 _LOG.info("compiled %s in %.1f s", name, duration_secs)
 

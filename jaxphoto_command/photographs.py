@@ -79,7 +79,7 @@ def fly(
     from jaxphoto.procedures.calibration import distortion_model
     from jaxphoto.procedures.flight import KnownOfFlight, calibrate_flight, flight_control
     from jaxphoto.report import prepare_pictures
-    from jaxphoto.report.flight import FlightSource, camera_sentences, part_folder, report_of, write_flight
+    from jaxphoto.report.flight import FlightSource, part_folder, print_flight, report_of, write_flight
     from jaxphoto.report.photographs import write_orientation
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.certificate import Provenance, certify
@@ -167,14 +167,7 @@ def fly(
                     write_orientation(part.oriented, folder, **matching)
                     write_provenance(part, folder)
             no_certificate = certify(work)
-    for k, (part, page) in enumerate(zip(flight.parts, reports, strict=True), 1):
-        report = part.oriented.report
-        size = f"{len(report.order)} photographs, {report.n_image_points} image points, {report.mean_px:.2f} px"
-        placed = part.placed.sentences if part.placed else (part.why_not,)
-        controlled = part.controlled.sentences if part.controlled else ()
-        output.say(f"part {k}: {size}", *(f"  {text}" for text in (*camera_sentences(page), *placed, *controlled)))
-    output.say(*(f"{name} is not used: {reason}" for name, reason in flight.left_out.items()), verdict.headline)
-    output.say(*(f"  {finding.text}" for finding in verdict.findings if finding.severity != "note"))
+    print_flight(flight, reports, verdict, initial, output.screen)
     if no_certificate:
         output.say(f"no certificate: {no_certificate}")
     output.wrote(out, f"results in {out} (open report.html)")

@@ -92,8 +92,16 @@ def mean_correlations(rows: Rows, columns: Mapping[str, str]) -> Measure:
 
 
 def check_points(rows: Rows) -> Measure:
-    """Compute mean and RMSE of surveyed minus computed at check points (000 T5, 004 T5)."""
-    return _by_row(rows, lambda tables: _discrepancies(tables) | {"n_check_points": len(tables.check_points)})
+    """Compute mean and RMSE of surveyed minus computed at check points (000 T5, 004 T5), and the RMSE expected from
+    their standard deviations.
+    """
+
+    def columns(tables: Tables) -> dict[str, float]:
+        check = tables.check_points
+        expected = {f"expected_rmse_{d}": float(np.sqrt((check[f"sigma_{d}"] ** 2).mean())) for d in _OFF}
+        return _discrepancies(tables) | expected | {"n_check_points": len(check)}
+
+    return _by_row(rows, columns)
 
 
 def _discrepancies(tables: Tables) -> dict[str, float]:

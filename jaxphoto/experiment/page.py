@@ -14,7 +14,7 @@ from markupsafe import Markup
 
 from jaxphoto.experiment.experiment import Run, compare
 from jaxphoto.report.block_plot import block_words, plot_block
-from jaxphoto.report.formatting import head_of, plus_minus, without_unit
+from jaxphoto.report.formatting import head_of, plus_minus, without_empty, without_unit
 from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot, page, provenance
 from jaxphoto.report.plots import axes_or_new, check_points_figure, new_figure, title
 from jaxphoto.writing import whole_folder
@@ -25,9 +25,15 @@ if TYPE_CHECKING:
 
 _LEGEND = (
     "In each cell, above: ours, the mean over {layouts} simulated layouts +- the standard deviation from layout to "
-    "layout. Below: what is printed (+- the tolerance promised). Green: within the tolerance; red and a cross: not; no "
-    "colour: nothing promised."
+    "layout. Below: the printed value (+- its tolerance). Green: within the tolerance; red and a cross: not. "
+    "Yellow: no tolerance, ours over printed beyond 2 or below 1/2. No colour: no tolerance."
 )
+_WITHOUT_TOLERANCE, _NOT_COMPUTED = "no tolerance is published", "not computed"
+# Ratio of a computed and a published value without tolerance beyond which the page marks it; signed columns have none.
+# Beginning of columns with the value that the standard deviations of ours predict.
+_EXPECTED = "expected_"
+_FAR, _SIGNED = 2.0, r"mean_(?!abs)"
+_STYLE = ".far { background: var(--amber); padding: 0 .3em }"
 _CELL = Markup('<span class="{}">{}{}</span><br>{}')
 _ACROSS = 5
 
@@ -38,13 +44,40 @@ def index_page(experiments: Mapping[str, tuple[str, pd.DataFrame]]) -> str:
 
 
 def agreement(comparison: pd.DataFrame) -> str:
-    """Summarise the number of printed values within their tolerance, and of those without tolerance."""
+    """Summarise the number of judged values within their tolerance, and of published values that are not judged."""
     good, judged = (int((comparison["within"].isin(words)).sum()) for words in (["yes"], ["yes", "no"]))
-    n = int(comparison["published"].notna().sum())
-    if not judged:
-        return "no printed value has a tolerance"
-    without = f"; {n - judged} of {n} printed values have no tolerance" if n > judged else ""
-    return f"{good} of {judged} printed values with a tolerance are within it{without}"
+    text = f"{good} of {judged} judged values within tolerance" if judged else "no value is judged"
+    reasons = not_judged(comparison)
+    few = {_WITHOUT_TOLERANCE: 0, "reason in the notes": 0, _NOT_COMPUTED: 0}
+    for reason, n in zip(reasons["reason"], reasons["values"], strict=True):
+        few[str(reason) if reason in few else "reason in the notes"] += int(n)
+    words = "; ".join(f"{name}: {n}" for name, n in few.items() if n)
+    return f"{text}; {reasons['values'].sum()} not judged ({words})" if len(reasons) else text
+
+
+def not_judged(comparison: pd.DataFrame) -> pd.DataFrame:
+    """Count the published values that are not judged: reason (the note of the cell, if any), values, tables."""
+    cells = comparison[(comparison["within"] == "") & comparison["published"].notna()]
+    reason = cells["note"].where(cells["note"] != "", _WITHOUT_TOLERANCE).where(cells["ours"].notna(), _NOT_COMPUTED)
+    groups = cells["table"].groupby(reason.rename("reason"), sort=False)
+    table = groups.agg(values="size", tables=lambda names: ", ".join(map(table_title, dict.fromkeys(names))))
+    return table.reset_index().sort_values("values", ascending=False, kind="stable", ignore_index=True)
+
+
+def far_apart(comparison: pd.DataFrame) -> pd.DataFrame:
+    """Tabulate values without tolerance that differ from the published ones by more than a factor of 2.
+
+    Columns: table, row, column, ours, published, ratio, expected (by the standard deviations of ours, if computed),
+    unit, note. Signed columns (means) have no ratio.
+    """
+    key = ["table", "row", "column"]
+    expected = comparison[comparison["column"].str.startswith(_EXPECTED)].set_index(key)["ours"]
+    positive = (comparison[["ours", "published"]] > 0).all(axis=1) & ~comparison["column"].str.match(_SIGNED)
+    ratio = (comparison["ours"] / comparison["published"]).where(positive & (comparison["within"] == ""))
+    far = comparison.assign(ratio=ratio)[(ratio > _FAR) | (ratio < 1 / _FAR)]
+    names = far.assign(column=_EXPECTED + far["column"].astype(str))[key].itertuples(index=False, name=None)
+    far = far.assign(expected=[expected.get(name, np.nan) for name in names])
+    return far[[*key, "ours", "published", "ratio", "expected", "unit", "note"]]
 
 
 def experiment_page(run: Run, comparison: pd.DataFrame, record: CommandRecord | None = None) -> str:
@@ -52,6 +85,19 @@ def experiment_page(run: Run, comparison: pd.DataFrame, record: CommandRecord | 
     judged, first = comparison[comparison["within"] != ""], next(iter(run.first.values()))
     colour = "" if judged.empty else "amber" if (judged["within"] == "no").any() else "green"
     parts: list[Part] = [Paragraph(f"skipped: {failure}", "warning") for failure in run.failures]
+    if len(reasons := not_judged(comparison)):
+        parts += [Heading("Values that are not judged"), reasons]
+    if len(far := far_apart(comparison)):
+        words = "Values without tolerance, more than twice or less than half of the printed ones (yellow below)."
+        if far["expected"].notna().any():
+            words += (
+                " Expected: by the standard deviations of our adjustment. Where ours agrees with it, the adjustment is "
+                "consistent, and the difference is one of the simulated block from that of the paper."
+            )
+        shown = far.assign(table=far["table"].map(table_title), column=far["column"].map(head_of))
+        for name in ("ours", "published", "ratio", "expected"):
+            shown[name] = ["" if np.isnan(v) else f"{v:.3g}" for v in shown[name]]
+        parts += [Paragraph(words), without_empty(shown.fillna(""))]
     if len(judged):
         words = "Ours minus printed over the tolerance, by table: within it between the lines, crosses beyond"
         parts += [Heading("Within the tolerances"), [Plot(partial(plot_agreement, comparison), words, 3.6)]]
@@ -66,18 +112,21 @@ def experiment_page(run: Run, comparison: pd.DataFrame, record: CommandRecord | 
         parts += [Heading("Check points of the first layout")]
         parts += [Plot(check_points_figure(check), "discrepancies at check points, in plan and in height")]
     parts += provenance(record) if record else []
-    return page(run.experiment.title, parts, (agreement(comparison), colour))
+    return page(run.experiment.title, parts, (agreement(comparison), colour), _STYLE)
 
 
 def printed_table(cells: pd.DataFrame) -> pd.DataFrame:
     """Return one table in the layout of the paper, as text: ours above the published value of each cell."""
-    rows: dict[str, dict[str, str]] = {str(row): {} for row in cells["row"]}
-    for cell in cells.to_dict("records"):
+    far, names = far_apart(cells)["ratio"], list(dict.fromkeys(cells["row"].astype(str)))
+    heads = [heading(str(column), unit) for column, unit in zip(cells["column"], cells["unit"], strict=True)]
+    # Cells are markup: columns of objects, because those of text would convert it.
+    table = pd.DataFrame("", index=pd.Index(names, name="row"), columns=list(dict.fromkeys(heads)), dtype=object)
+    for k, head, cell in zip(cells.index, heads, cells.to_dict("records"), strict=True):
         ours, printed = cell_words(cell)
-        mark = " ✗" if cell["within"] == "no" else ""
-        head = heading(str(cell["column"]), cell["unit"])
-        rows[str(cell["row"])][head] = _CELL.format(cell["within"], ours, mark, printed)
-    return pd.DataFrame(rows.values(), index=list(rows)).fillna("").reset_index(names="row")
+        mark = " ✗" if cell["within"] == "no" else f" (x {far[k]:.2g})" if k in far else ""
+        kind = "far" if k in far else cell["within"]
+        table.loc[str(cell["row"]), head] = _CELL.format(kind, ours, mark, printed)
+    return table.reset_index()
 
 
 def cell_words(cell: Mapping[Any, Any]) -> tuple[str, str]:

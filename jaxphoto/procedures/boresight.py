@@ -242,12 +242,9 @@ def _misalignment(adjusted: Adjustment, cov: Covariance, parameters: _SharedPara
     for mount in adjusted.unknowns.mounts:
         labels = {axis: f"mounts[{mount}].boresight_{axis}_rad" for axis in _ANGLES}
         angles = {_ANGLES[axis]: (parameters.value[label], parameters.sigma[label]) for axis, label in labels.items()}
-        values = ", ".join(
-            f"{name} {np.degrees(value):+.5f} ({np.degrees(sigma):.5f})" for name, (value, sigma) in angles.items()
-        )
         large = [name for name, (value, sigma) in angles.items() if abs(value) > SIGNIFICANT * sigma]
-        judged = f"significant: {', '.join(large)}" if large else "not significant"
-        messages.append(f"misalignment of mount {mount} in degrees (sigma): {values}; {judged}")
+        judged = f"significant in {', '.join(large)}" if large else "not significant"
+        messages.append(f"misalignment of mount {mount}: {judged}")
     rho, a, b = _strongest(cov, lambda x: "].boresight_" in x, lambda x: x.endswith(("].xp_mm", "].yp_mm")))
     if not a:
         return [*messages, "the principal point is fixed: its error is part of the misalignment"]

@@ -9,23 +9,28 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 import pandas as pd
 from rich.console import Console
 
 from jaxphoto.errors import InputError
-from jaxphoto.procedures.boresight import Step
+from jaxphoto.procedures.boresight import BoresightEstimate, Step
 from jaxphoto.report.findings import as_sentence
+from jaxphoto.report.formatting import label_unit, to_rich
 from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, label
 from jaxphoto.report.results import rounded, write_results, write_study
-from jaxphoto.report.tables import Tables
-from jaxphoto.report.terminal import print_lines
+from jaxphoto.report.tables import Tables, about_sigma, initial_values
+from jaxphoto.report.terminal import plain, print_lines
 from jaxphoto.report.verdict import verdict_of
+from jaxphoto.statistics import chi_square_p
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# Beginning of the parameters of step 4 that are differences.
+_DIFFERENCE = "step 4 - step 3: "
 # Length of error bars in standard deviations.
 _BARS = 2.0
 _ANGLES = re.compile(r"mounts\[.*\]\.boresight_._deg")
@@ -44,6 +49,10 @@ def boresight_verdict(steps: Sequence[Step]) -> str:
     return f"do not use the misalignment; failed steps: {names}"
 
 
+def _colour(steps: Sequence[Step]) -> str:
+    return "green" if all(step.go_on for step in steps) else "red"
+
+
 def steps_table(steps: Sequence[Step]) -> pd.DataFrame:
     """Tabulate sigma0 and all estimates of each step.
 
@@ -56,6 +65,36 @@ def steps_table(steps: Sequence[Step]) -> pd.DataFrame:
         rows.append((step.number, "sigma0", sigma0, sigma0 / math.sqrt(2 * redundancy) if redundancy > 0 else None, ""))
         rows += [(step.number, *estimate) for estimate in step.estimates]
     return pd.DataFrame(rows, columns=["step", "parameter", "value", "sigma", "unit"])
+
+
+def estimates(steps: Sequence[Step]) -> pd.DataFrame:
+    """Tabulate the result, the estimates of step 3 or of the last step: parameter, initial, value, sigma, unit."""
+    step, start = _result(steps), steps[0].adjusted.block.start.unknowns
+    rows = [one for one in step.estimates if not one.parameter.startswith(_DIFFERENCE)]
+    table, initial = pd.DataFrame(rows, columns=BoresightEstimate._fields), initial_values(start)
+    table.insert(1, "initial", [initial.get(path, np.nan) for path in table["parameter"]])
+    return table.assign(unit=[unit or label_unit(path, start.interior) for path, *_, unit in rows])
+
+
+def differences(steps: Sequence[Step]) -> pd.DataFrame:
+    """Tabulate step 4 minus step 3: parameter, difference, sigma, unit; empty without step 4."""
+    rows = [one for one in steps[-1].estimates if one.parameter.startswith(_DIFFERENCE)]
+    rows = [one._replace(parameter=one.parameter.removeprefix(_DIFFERENCE)) for one in rows]
+    return pd.DataFrame(rows, columns=["parameter", "difference", "sigma", "unit"])
+
+
+def tests_table(steps: Sequence[Step]) -> pd.DataFrame:
+    """Tabulate the test of each step: step, observations, sigma0, redundancy, p_value, passed."""
+    rows = []
+    for step in steps:
+        a = step.adjusted
+        p = chi_square_p(float(a.sum_of_squares), a.redundancy) if bool(a.converged) else np.nan
+        rows.append((step.number, step.title.partition(":")[0], f"{float(a.sigma0):.4f}", a.redundancy, p, step.go_on))
+    return pd.DataFrame(rows, columns=["step", "observations", "sigma0", "redundancy", "p_value", "passed"])
+
+
+def _result(steps: Sequence[Step]) -> Step:
+    return next((step for step in steps if step.number == 3), steps[-1])
 
 
 def plot_boresight(steps: Sequence[Step], ax: Axes | None = None, *, shifts: bool = False) -> Axes:
@@ -98,14 +137,19 @@ def _short(path: str) -> str:
 
 
 def boresight_parts(steps: Sequence[Step]) -> list[Part]:
-    """Return the parts of the page: misalignments, then findings and estimates of each step."""
+    """Return the parts of the page: result, test of each step, plots, then findings and estimates of each step."""
+    words = f"Estimates of step {_result(steps).number}. {about_sigma(_result(steps).adjusted)}"
+    parts: list[Part] = [estimates(steps), Paragraph(words)]
+    if len(table := differences(steps)):
+        parts += [Paragraph("Step 4 minus step 3, the effect of the control:"), table]
+    parts += [Paragraph("Steps, each with the chi-square test of sigma naught:"), tests_table(steps)]
     names = {False: "misalignments", True: "shifts of strips"}
     plots = [
         Plot(partial(plot_boresight, steps, shifts=shifts), f"{name} with bars of {_BARS:g} standard deviations")
         for shifts, name in names.items()
         if len(_rows(steps, shifts))
     ]
-    parts: list[Part] = [Heading("Misalignment and shifts"), plots] if plots else []
+    parts += [Heading("Misalignment and shifts"), plots] if plots else []
     for step in steps:
         parts.append(Heading(f"Step {step.number}: {step.title}"))
         parts += [Paragraph(as_sentence(finding)) for finding in step.findings]
@@ -138,12 +182,19 @@ def write_boresight(steps: Sequence[Step], directory: Path, seconds: dict[str, f
             spent = {name: times[name] for name in ("compile", "solve", "covariance")}
             write_results(tables, verdict_of(tables), work / f"step_{step.number}", spent, record=record)
         write_study(
-            work, f"{block.title or 'block'}: boresight", (verdict, "green" if passed else "red"),
+            work, f"{block.title or 'block'}: boresight", (f"{_colour(steps)}: {verdict}", _colour(steps)),
             boresight_parts(steps), summary, record, {"steps": steps_table(steps)},
         )  # fmt: skip
 
 
 def print_boresight(steps: Sequence[Step], console: Console) -> None:
-    """Print the verdict and the findings of each step."""
-    console.print(boresight_verdict(steps), style="green" if all(step.go_on for step in steps) else "red")
-    print_lines((f"step {step.number}: {'; '.join((step.title, *step.findings))}" for step in steps), console)
+    """Print the verdict, sigma naught and test of each step, the estimates, and the findings of each step."""
+    console.print(plain(steps[0].adjusted.block.title or "block"), style="bold")
+    colour = _colour(steps)
+    console.print(f"{colour}: {boresight_verdict(steps)}", style=f"bold {colour}", soft_wrap=True)
+    console.print(to_rich(tests_table(steps), "steps"))
+    console.print(to_rich(estimates(steps), f"estimates of step {_result(steps).number} (a posteriori)"))
+    if len(table := differences(steps)):
+        console.print(to_rich(table, "step 4 minus step 3"))
+    for step in steps:
+        print_lines((f"step {step.number}: {finding}" for finding in step.findings), console)

@@ -9,16 +9,18 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from rich.console import Console
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations import AXES
-from jaxphoto.report.formatting import column_unit
+from jaxphoto.report.formatting import column_unit, path_words, to_rich
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, page, provenance
 from jaxphoto.report.plots import axes_or_new, label
 from jaxphoto.report.results import assumed_pixels
+from jaxphoto.report.terminal import plain
 from jaxphoto.sensitivity import Draws
 from jaxphoto.writing import whole_file
 
@@ -150,14 +152,7 @@ def write_draws_page(
     record: CommandRecord,
 ) -> None:
     """Write report.html of the draws in `directory`: summary, its table, histograms and effects."""
-    few = ~table["quantity"].str.startswith(LONG)
-    ratio = table.loc[few, "ratio"].dropna()
-    ratios = "No estimate is predicted to change."
-    if len(ratio):
-        ratios = f"Standard deviations are {ratio.min():.3g} to {ratio.max():.3g} times the first-order prediction."
-    verdict = f"{summary['draws']} draws, {summary['converged']} converged. {ratios}"
-    # List the errors last: their distribution is known.
-    ordered = table[few].sort_values("quantity", key=lambda name: name.str.startswith("bias."), kind="stable")
+    few, ordered = ~table["quantity"].str.startswith(LONG), _ordered(table)
     shared = [name for name in ordered["quantity"] if not name.startswith("bias.")]
     draws = pd.read_parquet(directory / "draws.parquet", columns=["converged", *shared[:_SHOWN]])
     plots: list[Plot] = [
@@ -165,14 +160,45 @@ def write_draws_page(
         for name in shared[:_SHOWN]
     ]
     words = "Grey: histogram of the draws; red line: value without errors; blue line: predicted normal distribution."
-    parts: list[Part] = [*assumed_pixels(sensors), Heading("Estimates over the draws"), Paragraph(words), plots]
+    parts: list[Part] = [_shown(ordered), *assumed_pixels(sensors), Heading("Estimates over the draws")]
+    parts += [Paragraph(words), plots]
     if (file := directory / "effects.csv").is_file() and len(effects := pd.read_csv(file)) <= _ERRORS:
         words = "Effect of one sigma of each error (row) on each estimate (column), relative to its predicted sigma."
         draw = partial(plot_effects, effects, table, [name for name in shared if name in effects])
         parts += [Heading("Effect of each error on each estimate"), Plot(draw, words, max(3.2, 1 + 0.2 * len(effects)))]
-    parts += [Heading("Means and standard deviations"), ordered]
     if not few.all():
         parts.append(Paragraph("Images, points and trajectory knots are in summary.csv."))
-    text = page(f"Monte Carlo: {summary.get('title') or 'block'}", [*parts, *provenance(record)], (verdict, ""))
+    title, verdict = f"Monte Carlo: {summary.get('title') or 'block'}", (_verdict(summary, table), "")
+    text = page(title, [*parts, *provenance(record)], verdict)
     with whole_file(directory / "report.html") as work:
         work.write_text(text, encoding="utf-8")
+
+
+def _verdict(summary: Mapping[str, Any], table: pd.DataFrame) -> str:
+    ratio = table.loc[~table["quantity"].str.startswith(LONG), "ratio"].dropna()
+    ratios = "No estimate is predicted to change."
+    if len(ratio):
+        ratios = f"Standard deviations are {ratio.min():.3g} to {ratio.max():.3g} times the first-order prediction."
+    return f"{summary['draws']} draws, {summary['converged']} converged. {ratios}"
+
+
+def _ordered(table: pd.DataFrame) -> pd.DataFrame:
+    """Return the quantities that are not of images or points, errors last: their distribution is known."""
+    few = table[~table["quantity"].str.startswith(LONG)]
+    return few.sort_values("quantity", key=lambda name: name.str.startswith("bias."), kind="stable")
+
+
+def _shown(ordered: pd.DataFrame) -> pd.DataFrame:
+    """Return the table of the page: parameters in words."""
+    return ordered.assign(quantity=[path_words(name).partition(" [")[0] for name in ordered["quantity"]])
+
+
+def print_draws(summary: Mapping[str, Any], table: pd.DataFrame, console: Console) -> None:
+    """Print the number of draws, and mean and standard deviation of every estimate."""
+    console.print(plain(str(summary.get("title") or "block")), style="bold")
+    console.print(plain(_verdict(summary, table)), soft_wrap=True)
+    speed = f"{summary['draws_per_second']:.0f} draws per second"
+    console.print(f"{summary['fallbacks']} by a full adjustment; {speed}", soft_wrap=True)
+    rows = _ordered(table[~table["quantity"].str.startswith("bias.")])
+    columns = ["quantity", "nominal", "mean", "sd", "predicted_sigma", "ratio", "unit"]
+    console.print(to_rich(_shown(rows)[columns], "estimates over the draws"))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from functools import partial
 from pathlib import Path
@@ -10,6 +11,7 @@ from typing import TYPE_CHECKING, Any, NamedTuple
 
 import numpy as np
 import pandas as pd
+from rich.console import Console
 
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.camera.conditions import Conditions
@@ -17,8 +19,8 @@ from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.flight import CalibratedFlight, FlightPart
 from jaxphoto.report.certificate import known_conditions
-from jaxphoto.report.findings import Finding, Verdict, as_sentence, symbol
-from jaxphoto.report.formatting import plus_minus, without_empty
+from jaxphoto.report.findings import Finding, Verdict, as_sentence
+from jaxphoto.report.formatting import to_rich, without_empty
 from jaxphoto.report.page import (
     CommandRecord,
     Heading,
@@ -44,7 +46,8 @@ from jaxphoto.report.photographs import (
 from jaxphoto.report.plots import axes_or_new, label, plot_links, title
 from jaxphoto.report.residual_findings import component_findings, component_tables
 from jaxphoto.report.results import adjustment_sections, coverage_words, summary_table, write_results, write_summary
-from jaxphoto.report.tables import Tables, with_correlated_sigma
+from jaxphoto.report.tables import Tables, estimates_table, with_correlated_sigma
+from jaxphoto.report.terminal import print_lines, print_sigma0, print_verdict
 from jaxphoto.report.verdict import lens_findings, shutter_findings, verdict_of
 from jaxphoto.writing import InputFile, digest_of_all, whole_folder
 
@@ -155,14 +158,45 @@ def flight_verdict(flight: CalibratedFlight, reports: Sequence[PartReport], spoi
     return Verdict.of(found)
 
 
-def camera_sentences(report: PartReport) -> Iterator[str]:
-    """Yield sentences on c, x_p and y_p with their standard deviations, and on the rolling-shutter readout."""
-    table = report.tables.interior
-    estimated = table[table["sigma"].notna() & table["parameter"].isin(("c_mm", "xp_mm", "yp_mm"))]
-    each = estimated[["parameter", "value", "sigma"]].itertuples(index=False)
-    if values := [f"{symbol(name)} = {plus_minus(value, sigma)}" for name, value, sigma in each]:
-        yield f"{', '.join(values)} mm"
-    yield from (finding.text for finding in shutter_findings(report.tables))
+def flight_estimates(report: PartReport, start: InteriorOrientation | None) -> pd.DataFrame:
+    """Tabulate the estimates of a part: parameter, initial (of the camera `start`), value, sigma, unit.
+
+    All standard deviations of the camera contain the factor of correlated residuals.
+    """
+    adjusted = report.part.adjusted
+    unknowns = adjusted.block.start.unknowns
+    if start is not None:
+        unknowns = dataclasses.replace(unknowns, interior=dict.fromkeys(unknowns.interior, start))
+    table = estimates_table(report.tables, unknowns)
+    correlated = with_correlated_sigma(report.tables.interior, adjusted, report.sigma_factor)
+    paths = "interior[" + correlated["camera"].astype(str) + "]." + correlated["parameter"].astype(str)
+    sigma = dict(zip(paths, correlated["sigma_correlated"], strict=True))
+    return table.assign(sigma=table["parameter"].map(sigma).fillna(table["sigma"]))
+
+
+def sigma_words(report: PartReport) -> str:
+    """Describe the standard deviations of the camera."""
+    factor = report.sigma_factor
+    return "a posteriori" + (f", times {factor:.2g} for correlated residuals" if factor > 1 else "")
+
+
+def print_flight(
+    flight: CalibratedFlight, reports: Sequence[PartReport], verdict: Verdict, start: InteriorOrientation | None,
+    console: Console,
+) -> None:  # fmt: skip
+    """Print the verdict, then size, sigma naught, estimates and position of each part, and unused images."""
+    print_verdict(Verdict(tuple(finding for finding in verdict.findings if finding.severity != "note")), console)
+    for k, report in enumerate(reports, 1):
+        part, oriented = report.part, report.part.oriented.report
+        size = f"{len(oriented.order)} photographs, {oriented.n_image_points} image points, {oriented.mean_px:.2f} px"
+        print_lines([f"part {k}: {size}"], console)
+        print_sigma0(part.adjusted, console)
+        console.print(to_rich(flight_estimates(report, start), f"estimates ({sigma_words(report)})"))
+        sentences = [finding.text for finding in shutter_findings(report.tables)]
+        sentences += part.placed.sentences if part.placed else (part.why_not,)
+        sentences += part.controlled.sentences if part.controlled else ()
+        print_lines((f"  {text}" for text in sentences), console)
+    print_lines((f"{name} is not used: {reason}" for name, reason in flight.left_out.items()), console)
 
 
 # Page ------------------------------------------------------------------------------------------------------------
@@ -178,10 +212,12 @@ def flight_page(
 ) -> str:
     """Return the page as HTML, with the largest part in full. `folders`: result folders of the parts."""
     n_images = sum(len(r.images) for r in reports) + len(left_out) + len(spoilt)
-    parts: list[Part] = [flight_summary(reports, n_images), *verdict_parts(verdict)]
+    first, *others = reports
+    sigmas = f"Standard deviations are {sigma_words(first)} (sigma naught {float(first.part.adjusted.sigma0):.4f})."
+    parts: list[Part] = [flight_estimates(first, source.start), Paragraph(sigmas), flight_summary(reports, n_images)]
+    parts += verdict_parts(verdict)
     if unused := [(name, why.removeprefix(f"{name}: ")) for name, why in {**spoilt, **left_out}.items()]:
         parts += [Heading("Unused images"), pd.DataFrame(unused, columns=["image", "reason"])]
-    first, *others = reports
     parts += [*positions_section(first, source), *surveyed_section(first)]
     parts += [Paragraph(as_sentence(s)) for s in (source.camera_from, *first.part.lens) if s]
     parts += adjustment_sections(first.tables, source.start, first.sigma_factor)
@@ -386,7 +422,7 @@ def write_flight(
         with whole_folder(work / folder_name) as folder:
             entries = {"sigma_factor": r.sigma_factor, "flight": coverage_words(r.tables)}
             write_results(r.tables, r.verdict, folder, times, {**source.entries, **entries})
-            correlated = with_correlated_sigma(r.tables.interior, r.part.adjusted, r.part.oriented.report.alike)
+            correlated = with_correlated_sigma(r.tables.interior, r.part.adjusted, r.sigma_factor)
             correlated.to_csv(folder / "interior_correlated.csv", index=False)
             if r.part.controlled:
                 write_control(r.part.controlled, folder)

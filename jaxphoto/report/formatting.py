@@ -95,6 +95,17 @@ def without_unit(name: str) -> tuple[str, str]:
     return (name[: unit.start()], _UNITS[unit[1]]) if unit else (name, "")
 
 
+# Owners of parameters, by the first part of a path.
+_OWNERS = {"interior": "", "mounts": "mount ", "strips": "strip ", "points": "point ", "trajectory_knots": "strip "}
+
+
+def path_words(path: str) -> str:
+    """Return a parameter path in words: "kodak c [mm]" for interior[kodak].c_mm or kodak.c_mm."""
+    owner, _, name = path.rpartition(".")
+    kind, _, of = owner.partition("[" if "[" in owner else ".")
+    return f"{_OWNERS.get(kind, f'{kind} ')}{of.removesuffix(']')} {head_of(name)}".replace("  ", " ").strip()
+
+
 def head_of(name: str) -> str:
     """Return a column's name with its unit in brackets: "sigma X [m]" for sigma_X_m."""
     words, unit = without_unit(name)
@@ -132,7 +143,7 @@ def in_file_unit(unit: str) -> tuple[float, str]:
 # Columns whose standard deviation is in the column `sigma`, or `sd` for Monte Carlo draws.
 _BY_SIGMA = (
     "value", "estimate", "truth", "error", "first", "second", "difference", "residual", "amount",
-    "before", "after", "moved",
+    "before", "after", "moved", "initial", "A", "B", "B - A",
 )  # fmt: skip
 _BY_SD = ("nominal", "mean", "q025", "q50", "q975")
 # Columns whose standard deviation has a different name; of several columns the largest value is used.
@@ -142,6 +153,9 @@ _BY_OTHERS = {
     "gap_m": ("sigma_m",),
 }
 _SIGMAS = ("sd", "predicted_sigma", "worst_px")
+# Columns of parameters and their paths; columns of a table that replace the units of parameters.
+_PATHS, _PATH = ("parameter", "estimate", "parameter_a", "parameter_b", "with"), re.compile(r".+\]\.\w+$|[a-z_]+\.\w+$")
+_HAS_UNIT = {"unit", "rho", "estimate_unit"}
 # Number of significant digits of values without a standard deviation, by name without unit.
 _DIGITS = {
     "w": 3, "w_X": 3, "w_Y": 3, "w_Z": 3, "detectable": 3, "share": 2, "ratio": 3, "rmse": 3, "rms": 3, "fit": 3,
@@ -160,16 +174,17 @@ _PLACES = {
 
 def readable(table: pd.DataFrame) -> pd.DataFrame:
     """Format a table as text: digits by standard deviation, "yes" and "no", empty cells for missing values."""
-    return pd.DataFrame({name: _texts(table, name) for name in table.columns}, columns=table.columns)
+    # Objects: a column of text would lose markup.
+    texts = {name: pd.Series(_texts(table, name), table.index, object) for name in table.columns}
+    return pd.DataFrame(texts, columns=table.columns)
 
 
 def _texts(table: pd.DataFrame, name: str) -> list[str]:
     column = table[name]
-    if name == "parameter":
-        # Paths such as mounts[default].boresight_x_deg stay unchanged.
-        words = [head_of(v) if not re.search(r"[\[.]", v) and without_unit(v)[1] else v for v in column.astype(str)]
+    if name in _PATHS and not pd.api.types.is_numeric_dtype(column):
+        words = [path_words(v) if without_unit(v)[1] or _PATH.match(v) else v for v in column.astype(str)]
         # Correlations have no unit; a table may have a column of units instead.
-        return [word.partition(" [")[0] for word in words] if {"unit", "rho"} & set(table.columns) else words
+        return [word.partition(" [")[0] for word in words] if _HAS_UNIT & set(table.columns) else words
     if name == "group":
         return [str(v).replace("_", " ") for v in column]
     if not pd.api.types.is_float_dtype(column):

@@ -10,21 +10,21 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from rich.console import Console
 
-from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import InputError
 from jaxphoto.lidar import HeightFlag
 from jaxphoto.observations import AXES
-from jaxphoto.procedures.lidar import LidarControl, Round, Simultaneous
+from jaxphoto.procedures.lidar import LidarControl, RoofControl, Round, Simultaneous
 from jaxphoto.procedures.lidar.vertical_control import flag_counts
-from jaxphoto.report.findings import as_sentence
-from jaxphoto.report.formatting import without_empty, without_unit
+from jaxphoto.report.findings import Verdict, as_sentence
+from jaxphoto.report.formatting import in_figures, label_unit, to_rich, without_empty
 from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot, page, provenance, verdict_parts
 from jaxphoto.report.plots import axes_or_new, title
 from jaxphoto.report.results import summary_of, write_results, write_study
-from jaxphoto.report.tables import Tables
-from jaxphoto.report.verdict import verdict_of
-from jaxphoto.statistics import angle_differences, correlation_matrix
+from jaxphoto.report.tables import Tables, about_sigma, estimates_table
+from jaxphoto.report.terminal import plain, print_lines, print_sigma0, print_verdict
+from jaxphoto.statistics import Covariance, angle_differences, correlation_matrix
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
@@ -64,20 +64,22 @@ def surfaces_table(result: Simultaneous) -> pd.DataFrame:
     return pd.DataFrame(columns | {"above_before_m": result.apart_before, "above_m": result.apart})
 
 
-def moved_table(result: Simultaneous) -> pd.DataFrame:
+def moved_table(result: Simultaneous, tables: Tables | None = None) -> pd.DataFrame:
     """Tabulate the changes of the parameters of cameras, scanner, mounts and strips.
 
     Columns: what, before, after, moved, sigma (a posteriori), unit. The last rows are RMS changes of camera stations,
-    rotations, object points and laser points, and the RMS height of points above the surface.
+    rotations, object points and laser points, and the RMS height of points above the surface. `tables`: of the result,
+    if already computed.
     """
     after, before = result.adjusted, result.before
     # Only scanner parameters have no value before the adjustment; use zero.
     then, now = (dict(zip(a.parameters, np.asarray(a.values.shared).tolist(), strict=True)) for a in (before, after))
     rows: list[tuple] = []
-    for path, s in zip(after.structure.labels, np.asarray(Tables(after).covariance.shared_sigma), strict=True):
+    sigma = np.asarray((tables or Tables(after)).covariance.shared_sigma)
+    for path, s in zip(after.structure.labels, sigma, strict=True):
         name, factor = path.replace("_rad", "_deg"), 180 / np.pi if path.endswith("_rad") else 1.0
         old, new = factor * then.get(path, 0.0), factor * now[path]
-        rows.append((name, old, new, new - old, factor * float(s), without_unit(name)[1]))
+        rows.append((name, old, new, new - old, factor * float(s), label_unit(name, after.unknowns.interior)))
     exterior = np.asarray(after.unknowns.exterior.position) - np.asarray(before.unknowns.exterior.position)
     points = np.asarray(after.unknowns.points) - np.asarray(before.unknowns.points)
     angles = np.rad2deg(angle_differences(after, before)[1])
@@ -95,12 +97,27 @@ def _rms(values: np.ndarray) -> float:
     return float(np.sqrt(np.nanmean(np.asarray(values) ** 2)))
 
 
-def scanner_correlations(adjusted: Adjustment) -> pd.DataFrame:
+def _estimates(moved: pd.DataFrame) -> pd.DataFrame:
+    """Return the parameters of `moved_table`: parameter, initial, value, sigma, unit."""
+    names = {"what": "parameter", "before": "initial", "after": "value"}
+    return moved[moved["sigma"].notna()].rename(columns=names).drop(columns="moved")
+
+
+def _root_mean_squares(moved: pd.DataFrame) -> pd.DataFrame:
+    """Return the RMS changes of `moved_table` by group as text: change of, X, Y, Z, unit."""
+    rows = moved[moved["before"].isna()]
+    group = rows["what"].str.partition(",")[0].replace("images", "omega, phi, kappa")
+    return pd.DataFrame([
+        {"RMS change of": name, **dict(zip(AXES, (in_figures(v, 3) for v in of["moved"]), strict=True)), "unit": unit}
+        for (name, unit), of in rows.groupby([group, "unit"], sort=False)
+    ])  # fmt: skip
+
+
+def scanner_correlations(covariance: Covariance) -> pd.DataFrame:
     """Tabulate correlations of boresight and scanner shifts with each other and with the cameras.
 
     Columns: parameter_a, parameter_b, rho.
     """
-    covariance = Tables(adjusted).covariance
     first = 6 * covariance.n_images
     rho, paths = correlation_matrix(covariance)[first:, first:], covariance.labels[first:]
     scanner = [k for k, path in enumerate(paths) if path.startswith("scanner")]
@@ -111,12 +128,12 @@ def scanner_correlations(adjusted: Adjustment) -> pd.DataFrame:
 def plot_above(result: Simultaneous, ax: Axes | None = None, *, before: bool = False) -> Axes:
     """Draw heights of points above the surface of the cloud (m), after the adjustment or `before` it.
 
-    The colour scale spans 95 % of the heights before.
+    The colour scale spans 95 % of them.
     """
     ax, values = axes_or_new(ax), result.apart_before if before else result.apart
     points = np.asarray(result.adjusted.unknowns.points)[result.points]
     name = f"{'before' if before else 'after'}: RMSE {_rms(values):.3f} m"
-    _draw_heights(ax, points, values, result.apart_before, "point above the surface [m]", name)
+    _draw_heights(ax, points, values, "point above the surface [m]", name)
     return ax
 
 
@@ -132,7 +149,7 @@ def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residua
     if residuals:
         v = (control.height - points[:, 2])[used]
         name = f"cloud minus adjusted: RMSE {_rms(v):.3f} m"
-        _draw_heights(ax, points[used], v, v, "cloud minus adjusted height [m]", name)
+        _draw_heights(ax, points[used], v, "cloud minus adjusted height [m]", name)
         return ax
     sets = ((missing, "no height", "0.6", "+"), (used, "control", "tab:blue", "o"))
     for chosen, words, colour, marker in (*sets, (~used & ~missing, "rejected", "#D55E00", "x")):
@@ -143,9 +160,9 @@ def plot_lidar_heights(control: LidarControl, ax: Axes | None = None, *, residua
     return ax
 
 
-def _draw_heights(axes: Axes, points: np.ndarray, values: np.ndarray, scale: np.ndarray, words: str, name: str) -> None:
-    """Draw values in plan; the colour scale spans 95 % of `scale`."""
-    limit = float(np.nanpercentile(np.abs(scale), 95)) or 1.0
+def _draw_heights(axes: Axes, points: np.ndarray, values: np.ndarray, words: str, name: str) -> None:
+    """Draw values in plan; the colour scale spans 95 % of them."""
+    limit = float(np.nanpercentile(np.abs(values), 95)) or 1.0
     colours: dict[str, Any] = {"c": values, "cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     shown = axes.scatter(points[:, 0], points[:, 1], s=18, edgecolor="0.6", **colours)
     axes.figure.colorbar(shown, ax=axes, label=words, shrink=0.8)
@@ -156,31 +173,28 @@ def _draw_heights(axes: Axes, points: np.ndarray, values: np.ndarray, scale: np.
 
 @contextmanager
 def write_simultaneous(
-    result: Simultaneous, directory: Path, seconds: dict[str, float], record: CommandRecord
-) -> Iterator[Path]:
+    result: Simultaneous, tables: Tables, verdict: Verdict, directory: Path, seconds: dict[str, float],
+    record: CommandRecord,
+) -> Iterator[Path]:  # fmt: skip
     """Write the tables of iterations, changes, surfaces and correlations, the report and the folder `adjustment`.
 
-    Yields the temporary folder so that the caller can add files.
+    `tables` contains the adjustment of the result. Yields the temporary folder so that the caller can add files.
     """
     with whole_folder(directory) as work:
-        tables = Tables(result.adjusted)
-        verdict, times = verdict_of(tables), result.adjusted.seconds
+        times = tables.adjusted.seconds
         spent = {name: times[name] for name in ("compile", "solve", "covariance")}
         write_results(tables, verdict, work / "adjustment", spent, record=record)
-        rounds, moved, correlations = (
-            rounds_table(result.rounds),
-            moved_table(result),
-            scanner_correlations(result.adjusted),
-        )
-        free = moved["sigma"].notna()
+        rounds, moved = rounds_table(result.rounds), moved_table(result, tables)
+        correlations = scanner_correlations(tables.covariance)
+        iterations = rounds_words(result.rounds, result.converged)
         parts: list[Part] = [
-            *verdict_parts(verdict),
-            *(Paragraph(as_sentence(sentence)) for sentence in rounds_words(result.rounds, result.converged)),
-            Link("all results of the images", "adjustment/report.html"), Heading("Changes"), moved[free],
-            Paragraph("Root mean square changes:"), without_empty(moved[~free]),
+            _estimates(moved), Paragraph(about_sigma(tables.adjusted)), *map(Paragraph, map(as_sentence, iterations)),
+            *verdict_parts(verdict), Link("all results of the images", "adjustment/report.html"),
+            Heading("Points and surface of the cloud"),
             [Plot(partial(plot_above, result, before=b), f"points above the cloud {w}", 4)
-             for b, w in ((True, "before"), (False, "after"))], Heading("Iterations"),
-            rounds.replace(np.inf, np.nan), Heading("Correlations of the scanner"),
+             for b, w in ((True, "before"), (False, "after"))],
+            _root_mean_squares(moved), Heading("Iterations"), rounds.replace(np.inf, np.nan),
+            Heading("Correlations of the scanner"),
             Paragraph("The strongest; all are in scanner_correlation.csv."), _strongest(correlations),
         ]  # fmt: skip
         files = {
@@ -196,6 +210,26 @@ def write_simultaneous(
             summary | {"rounds": len(result.rounds), "iteration_converged": result.converged}, record, files,
         )  # fmt: skip
         yield work
+
+
+def print_simultaneous(result: Simultaneous, tables: Tables, verdict: Verdict, console: Console) -> None:
+    """Print the verdict, sigma naught, the iterations, the estimates and RMS changes."""
+    console.print(plain(tables.adjusted.block.title or "block"), style="bold")
+    print_verdict(verdict, console)
+    print_sigma0(tables.adjusted, console)
+    print_lines(rounds_words(result.rounds, result.converged), console)
+    moved = moved_table(result, tables)
+    console.print(to_rich(_estimates(moved), "estimates (a posteriori)"))
+    console.print(to_rich(_root_mean_squares(moved)))
+
+
+def print_control(control: LidarControl | RoofControl, console: Console) -> None:
+    """Print the iterations, sigma naught and the estimates of an adjustment with control from a cloud."""
+    console.print(plain(control.block.title or "block"), style="bold")
+    print_lines(rounds_words(control.rounds, control.converged), console)
+    print_sigma0(control.adjusted, console)
+    if len(table := estimates_table(Tables(control.adjusted))):
+        console.print(to_rich(table, "estimates (a posteriori)"))
 
 
 def _strongest(correlations: pd.DataFrame) -> pd.DataFrame:
@@ -230,7 +264,8 @@ def heights_page(control: LidarControl, record: CommandRecord) -> str:
         if control.used.any() or not r
     ]
     parts: list[Part] = [
-        *(Paragraph(as_sentence(text)) for text in (words[1], used)),
+        estimates_table(Tables(control.adjusted)),
+        *(Paragraph(as_sentence(text)) for text in (about_sigma(control.adjusted), words[1], used)),
         Heading("Over the ground"),
         plots,
     ]
@@ -239,4 +274,5 @@ def heights_page(control: LidarControl, record: CommandRecord) -> str:
         parts.append(pd.DataFrame({"flag": [name.lower() for name in flags], "heights": list(flags.values())}))
     parts += [Heading("Largest differences"), without_empty(largest.round(3))]
     parts += [Paragraph("All heights are in lidar_heights.csv."), *provenance(record)]
-    return page(f"{control.block.title or 'Block'}: heights of a cloud as control", parts, (words[0], ""))
+    name = f"{control.block.title or 'Block'}: heights of a cloud as control"
+    return page(name, parts, (words[0], "green" if control.converged else "red"))

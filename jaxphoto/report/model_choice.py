@@ -15,7 +15,7 @@ from jaxphoto.block import Block
 from jaxphoto.errors import InputError
 from jaxphoto.procedures.model_choice import ModelChoice
 from jaxphoto.report.formatting import to_rich, without_empty
-from jaxphoto.report.page import CommandRecord, Heading, Part, Plot
+from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, label, title
 from jaxphoto.report.results import assumed_pixels, rounded, write_study
 from jaxphoto.report.terminal import print_lines
@@ -25,8 +25,13 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
 # Columns of `choice_table` in the terminal, and further ones on the page.
-_IN_TERMINAL = ["model", "parameters", "rms_px", "cv_rms_px", "cv_excess_se", "delta_bic", "f_p"]
-_ON_PAGE = [*_IN_TERMINAL, "sigma0", "delta_aicc", "smaller", "f", "weakest", "weakest_ratio"]
+_IN_TERMINAL = ["model", "parameters", "sigma0", "redundancy", "rms_px", "cv_rms_px", "cv_excess_se", "delta_bic"]
+_ON_PAGE = [*_IN_TERMINAL, "delta_aicc", "smaller", "f", "f_p", "weakest", "weakest_ratio"]
+_HEADS = {
+    "cv_rms_px": "held-out_rms_px", "cv_excess_se": "above the best [standard errors]",
+    "delta_bic": "BIC above the best", "delta_aicc": "AICc above the best", "smaller": "smaller model", "f": "F",
+    "f_p": "p_value", "weakest": "least significant", "weakest_ratio": "its ratio",
+}  # fmt: skip
 # Difference of BIC below which two models are equally good (Kass and Raftery 1995).
 _EQUAL = 2.0
 
@@ -125,10 +130,12 @@ def write_model_choice(
     verdict, table, parameters = choice_verdict(choice), choice_table(choice), parameter_table(choice)
     names = {False: "BIC above the smallest, by model", True: "RMS of image points adjusted and held out, by model"}
     plots: list[Plot] = [Plot(partial(plot_models, choice, rms=rms), name) for rms, name in names.items()]
+    chosen: list[Part] = [_chosen(choice), Paragraph(f"Estimates of {choice.by_bic}, a posteriori.")]
     parts: list[Part] = [
+        *(chosen if choice.by_bic else []),
         *assumed_pixels(block.sensors),
         Heading("Models"),
-        without_empty(table[_ON_PAGE]),
+        without_empty(table[_ON_PAGE]).rename(columns=_HEADS),
         plots if choice.by_bic else [],
         Heading("Estimated parameters of every model"),
         parameters,
@@ -144,6 +151,15 @@ def write_model_choice(
 
 
 def print_model_choice(choice: ModelChoice, console: Console) -> None:
-    """Print the choice and its table."""
+    """Print the choice, its table, and the estimates of the chosen model."""
     print_lines(choice_verdict(choice), console)
-    console.print(to_rich(without_empty(choice_table(choice)[_IN_TERMINAL])))
+    console.print(to_rich(without_empty(choice_table(choice)[_IN_TERMINAL]).rename(columns=_HEADS), "models"))
+    if choice.by_bic:
+        console.print(to_rich(_chosen(choice), f"estimates of {choice.by_bic} (a posteriori)"))
+
+
+def _chosen(choice: ModelChoice) -> pd.DataFrame:
+    """Return the estimates of the model with the smallest BIC: camera (if several), parameter, value, sigma, unit."""
+    table = parameter_table(choice)
+    table = table[table["model"] == choice.by_bic][["camera", "parameter", "value", "sigma", "unit"]]
+    return table if len(set(table["camera"])) > 1 else table.drop(columns="camera")

@@ -2,22 +2,25 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 import pandas as pd
+from rich.console import Console
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
 from jaxphoto.report.findings import in_symbols
-from jaxphoto.report.formatting import label_unit, readable
+from jaxphoto.report.formatting import in_figures, label_unit, of_sigma, path_words, to_rich, with_sigma
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, label
 from jaxphoto.report.results import assumed_pixels, rounded, write_study
-from jaxphoto.report.tables import Tables
+from jaxphoto.report.tables import Tables, about_sigma, estimates_table
+from jaxphoto.report.terminal import plain, print_sigma0
 from jaxphoto.sensitivity.exact import Sensitivity, sensitivity
 from jaxphoto.sensitivity.influence import DELTA0, Per, external_reliability, station_bias, variance_shares
 from jaxphoto.writing import whole_folder
@@ -27,8 +30,6 @@ if TYPE_CHECKING:
 
 # Columns of the largest changes in summary.json.
 _LARGEST = ("unit", "axis", "exact", "first_order", "over_sigma", "estimate_unit")
-# Maximum number of interior parameters in the figure.
-_SHOWN = 6
 
 
 class SensitivityTables:
@@ -67,9 +68,18 @@ class SensitivityTables:
         return {name: label_unit(name, self.adjusted.unknowns.interior) for name in self._estimates}
 
     @cached_property
-    def _sigma(self) -> np.ndarray:
-        """A priori sigmas of all estimates."""
-        return np.sqrt(variance_shares(self.adjusted, self.exact).variance)
+    def tables(self) -> Tables:
+        """Tables of the adjustment."""
+        return Tables(self.adjusted)
+
+    @cached_property
+    def sigma(self) -> pd.Series:
+        """Standard deviations of the estimates (a posteriori), as in `Tables`; NaN for fixed ones."""
+        c, points = self.tables.covariance, self.adjusted.block.points
+        sigma = dict(zip(self.adjusted.structure.labels, np.asarray(c.shared_sigma), strict=True))
+        at = np.asarray(c.point_sigma)
+        sigma |= {f"points[{p}].{a}": at[points.index(p), k] for p in self.check for k, a in enumerate(AXES)}
+        return pd.Series([sigma.get(name, np.nan) for name in self._estimates], self._estimates).where(lambda v: v > 0)
 
     @cached_property
     def bias(self) -> pd.DataFrame:
@@ -90,12 +100,11 @@ class SensitivityTables:
     def largest(self) -> pd.DataFrame:
         """Largest effect on each interior parameter.
 
-        Columns: estimate, exact, over_sigma (a priori), first_order, unit, axis, estimate_unit.
+        Columns: estimate, exact, over_sigma (a posteriori), first_order, unit, axis, estimate_unit.
         """
         interior = self.bias[self.bias["estimate"].str.startswith("interior")]
         most = interior.loc[interior.groupby("estimate", sort=False)["exact"].apply(lambda v: v.abs().idxmax())]
-        sigma = dict(zip(self.exact.labels, self._sigma, strict=True))
-        over = most["exact"] / most["estimate"].map(sigma).where(lambda v: v > 0)
+        over = most["exact"] / most["estimate"].map(self.sigma)
         columns = ["estimate", "exact", "over_sigma", "first_order", "unit", "axis", "estimate_unit"]
         return most.assign(over_sigma=over)[columns].reset_index(drop=True)
 
@@ -123,10 +132,12 @@ class SensitivityTables:
         """Observation whose bias of one MDB has the largest effect, by estimate and group.
 
         Columns: estimate, group, image, point, axis, redundancy_number, detectable (MDB), unit, effect,
-        effect_over_sigma (a priori), estimate_unit. Unchecked observations are skipped; the summary contains their
-        number.
+        effect_over_sigma, estimate_unit. MDB, effect and the standard deviation of the last ratio are a priori, as in
+        `Tables.residuals`: the ratio does not depend on sigma naught. Unchecked observations are skipped; the summary
+        contains their number.
         """
-        reliability, sigma, tables = external_reliability(self.adjusted, self.exact, self.delta0), self._sigma, []
+        reliability = external_reliability(self.adjusted, self.exact, self.delta0)
+        sigma, tables = self.sigma.to_numpy() / np.sqrt(float(self.tables.covariance.variance_factor)), []
         for group, effect in reliability.effect.items():
             mdb = reliability.mdb[group]
             checked = np.isfinite(mdb)
@@ -139,15 +150,14 @@ class SensitivityTables:
             table.insert(0, "estimate", self._estimates)
             table.insert(6, "detectable", rows["factor"].to_numpy()[worst] * mdb[worst])
             table["effect"] = effect[np.arange(len(effect)), worst]
-            own = sigma[self._rows]
-            table["effect_over_sigma"] = table["effect"] / np.where(own > 0, own, np.nan)
+            table["effect_over_sigma"] = table["effect"] / sigma
             tables.append(table.assign(estimate_unit=table["estimate"].map(self._units)))
         return pd.concat(tables, ignore_index=True).sort_values("estimate", kind="stable", ignore_index=True)
 
     @cached_property
     def _observations(self) -> dict[str, pd.DataFrame]:
         """Observations by group, one row per column of `Sensitivity.groups`, with the factor to the unit of tables."""
-        table = Tables(self.adjusted).residuals[["group", "image", "point", "axis", "redundancy_number", "unit"]]
+        table = self.tables.residuals[["group", "image", "point", "axis", "redundancy_number", "unit"]]
         table = table.assign(factor=np.where(table["unit"] == "deg", 180 / np.pi, 1.0))
         return {str(group): rows for group, rows in table.groupby("group")}
 
@@ -187,6 +197,88 @@ def _rms(values: pd.Series) -> float:
     return float(np.sqrt((values**2).mean()))
 
 
+def sensitivity_verdict(tables: SensitivityTables) -> str:
+    """State the largest effect of the station bias on an interior parameter."""
+    verdict = f"Effects of a station bias of {tables.bias_m:g} m per {tables.per}"
+    if not len(most := tables.largest.dropna()):
+        return verdict
+    worst = most.iloc[int(most["over_sigma"].abs().to_numpy().argmax())]
+    return (
+        f"{verdict}: at most {abs(worst['over_sigma']):.2f} sigma, {in_symbols(worst['estimate'])} by a bias of "
+        f"{worst['unit']} in {worst['axis']}"
+    )
+
+
+def largest_effects(tables: SensitivityTables) -> pd.DataFrame:
+    """Tabulate the interior parameters with the largest effect of the station bias on each, as text.
+
+    Columns: parameter, value, sigma, unit, largest effect, in sigma, by.
+    """
+    largest, sizes = tables.largest.set_index("estimate"), estimates_table(tables.tables).set_index("parameter")
+    rows = []
+    for path, effect in zip(largest.index.astype(str), largest.to_dict("records"), strict=True):
+        value, sigma = (float(sizes[name].get(path, np.nan)) for name in ("value", "sigma"))
+        rows.append({
+            "parameter": path_words(str(path)).partition(" [")[0], "value": with_sigma(value, sigma),
+            "sigma": of_sigma(sigma), "largest effect": with_sigma(effect["exact"], 0.1 * sigma),
+            "unit": effect["estimate_unit"], "in sigma": f"{effect['over_sigma']:.2f}",
+            f"by {tables.per}": f"{effect['unit']} in {effect['axis']}",
+        })  # fmt: skip
+    return pd.DataFrame(rows)
+
+
+def effects_by_unit(tables: SensitivityTables) -> pd.DataFrame:
+    """Tabulate the effects of the station bias as text, one row per unit and axis.
+
+    Columns: unit, axis, one per interior parameter (in sigma), and RMS effects on the check points.
+    """
+    bias, columns = tables.bias, {}
+    for title, names in tables.panels.items():
+        chosen = bias[bias["estimate"].isin(names)].groupby(["unit", "axis"], sort=False)["exact"]
+        if len(names) == 1 and names[0].startswith("interior"):
+            head = f"{path_words(title).partition(' [')[0]} [sigma]"
+            columns[head] = (chosen.sum() / tables.sigma[names[0]]).map("{:.2f}".format)
+        else:
+            columns[title] = chosen.agg(_rms).map("{:.4f}".format)
+    return pd.DataFrame(columns).reset_index(names=[tables.per, "axis"])
+
+
+def contributions(tables: SensitivityTables) -> pd.DataFrame:
+    """Tabulate the variance fractions of the interior parameters as text, one column per group of observations."""
+    shares = tables.variance_shares
+    rows = []
+    for path, of in shares[shares["estimate"].str.startswith("interior")].groupby("estimate", sort=False):
+        worst = of.iloc[int(of["largest_share"].to_numpy().argmax())]
+        rows.append({
+            "parameter": path_words(str(path)).partition(" [")[0],
+            **{str(g).replace("_", " "): f"{100 * v:.1f} %" for g, v in zip(of["group"], of["share"], strict=True)},
+            "largest contribution": f"{100 * worst['largest_share']:.1f} %", "by": _observation(worst),
+        })  # fmt: skip
+    return pd.DataFrame(rows).fillna("")
+
+
+def reliability(tables: SensitivityTables) -> pd.DataFrame:
+    """Tabulate the external reliability of the interior parameters as text.
+
+    Columns: parameter, observation, r, MDB, effect [sigma].
+    """
+    table = tables.external_reliability
+    return pd.DataFrame([
+        {
+            "parameter": path_words(row["estimate"]).partition(" [")[0], "observation": _observation(row),
+            "r": f"{row['redundancy_number']:.3f}", "MDB": f"{in_figures(row['detectable'], 3)} {row['unit']}",
+            "effect [sigma]": f"{row['effect_over_sigma']:.2f}",
+        }
+        for row in table[table["estimate"].str.startswith("interior")].to_dict("records")
+    ])  # fmt: skip
+
+
+def _observation(row: Mapping[Any, Any] | pd.Series) -> str:
+    words = [str(row["group"]).replace("_", " ").removesuffix("s")]
+    words += [f"{name} {row[name]}" for name in ("point", "image") if row[name]]
+    return f"{', '.join(words)}, {row['axis']}"
+
+
 def write_sensitivity(
     tables: SensitivityTables, directory: Path, seconds: dict[str, float], record: CommandRecord
 ) -> None:
@@ -196,37 +288,50 @@ def write_sensitivity(
         "sensitivity": tables.bias, "variance_shares": tables.variance_shares,
         "external_reliability": tables.external_reliability,
     }  # fmt: skip
-    changes, shares, reliability = (t[t["estimate"].str.startswith("interior")] for t in files.values())
-    verdict = f"Effects of a station bias of {tables.bias_m:g} m per {tables.per}"
-    if len(most := tables.largest.dropna()):
-        worst = most.iloc[int(most["over_sigma"].abs().to_numpy().argmax())]
-        verdict += (
-            f": at most {abs(worst['over_sigma']):.2f} sigma, {in_symbols(worst['estimate'])} by a bias of "
-            f"{worst['unit']} in {worst['axis']}"
-        )
+    verdict = sensitivity_verdict(tables)
+    interior = tables.bias["estimate"].str.startswith("interior")
+    over = (tables.bias["difference"].abs() / tables.bias["estimate"].map(tables.sigma))[interior]
     parts: list[Part] = [
+        largest_effects(tables),
         Paragraph(
-            f"{adjusted.block.title or 'Block'}: sigma naught {float(adjusted.sigma0):.4g}, redundancy "
-            f"{adjusted.redundancy}, {len(tables.check)} check points."
+            f"{about_sigma(adjusted)} They are those of jaxphoto adjust. {adjusted.block.title or 'Block'}: "
+            f"{len(tables.check)} check points. Exact and first-order effects on the interior orientation differ by at "
+            f"most {over.max():.2g} sigma."
         ),
         *assumed_pixels(adjusted.block.sensors),
-        Heading("Largest effects"),
-        tables.largest.rename(columns={"unit": tables.per}),
+        Heading("Effects of the station bias"),
+        Paragraph(
+            f"Exact effect of {tables.bias_m:g} m on each interior parameter (in its sigma), and RMS effect on the "
+            "check points. sensitivity.csv has all estimates with their units and the first-order effects."
+        ),
+        effects_by_unit(tables),
         [
             Plot(partial(plot_sensitivity, tables, name), f"effects of a station bias on {name}: exact and first-order")
             for k, name in enumerate(tables.panels)
-            if k < _SHOWN or name.startswith("check points")
+            if k == 0 or name.startswith("check points, Z")
         ],
-        Heading("Effects on the interior orientation"),
-        changes.rename(columns={"unit": tables.per}),
-        Paragraph("All estimates are in sensitivity.csv."),
         Heading("Variance contributions by observation group"),
-        readable(shares).rename(columns={"share": "fraction", "largest_share": "largest fraction"}),
+        Paragraph("Fraction of the variance of each parameter, and the observation that contributes most."),
+        contributions(tables),
         Heading("External reliability"),
-        readable(reliability).rename(columns={"detectable": "MDB", "redundancy_number": "r"}),
+        Paragraph(
+            "Observation of each group whose bias of one MDB (minimal detectable bias) changes the parameter most. r "
+            "is the redundancy number. The effect in sigma does not depend on sigma naught: it is that of the page of "
+            "jaxphoto adjust."
+        ),
+        reliability(tables),
     ]
     with whole_folder(directory) as work:
         write_study(work, "Sensitivity", (verdict, ""), parts, _summary(tables, seconds), record, files)
+
+
+def print_sensitivity(tables: SensitivityTables, console: Console) -> None:
+    """Print the verdict, sigma naught, and the largest effect on each interior parameter."""
+    console.print(plain(tables.adjusted.block.title or "block"), style="bold")
+    console.print(plain(sensitivity_verdict(tables)), soft_wrap=True)
+    print_sigma0(tables.adjusted, console)
+    name = f"largest effects of a station bias of {tables.bias_m:g} m per {tables.per} (sigma a posteriori)"
+    console.print(to_rich(largest_effects(tables), name))
 
 
 def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:

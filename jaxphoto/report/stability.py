@@ -15,11 +15,12 @@ from jaxphoto.camera import InteriorOrientation, Sensor
 from jaxphoto.errors import camera_words
 from jaxphoto.procedures.compare import Halves
 from jaxphoto.report.findings import as_sentence, p_words
-from jaxphoto.report.formatting import to_rich, without_empty
+from jaxphoto.report.formatting import in_figures, of_p, of_sigma, to_rich, with_sigma, without_empty
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot
 from jaxphoto.report.plots import axes_or_new, draw_format, draw_format_map, title
 from jaxphoto.report.results import assumed_pixel_words, assumed_pixels, write_study
-from jaxphoto.report.terminal import print_lines
+from jaxphoto.report.tables import Tables, estimates_table
+from jaxphoto.report.terminal import plain, print_lines, print_sigma0
 from jaxphoto.stability import ALIGNED, LEVEL, Analysis, Change, Method
 from jaxphoto.stability.comparison import change_meaning
 from jaxphoto.writing import whole_folder
@@ -85,16 +86,26 @@ def stability_table(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_
 
 
 def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: float) -> pd.DataFrame:
-    """Transpose the stability table to one column per method, in micrometres."""
-    table = stability_table(analyses, pixel_mm, noise_mm).set_index("method")
-    um = {
-        "RMSE_offset": "rmse_offset_mm", "as measured": "rmse_measured_mm", "largest": "largest_mm",
-        "sigma": "sigma_mm", "95 % from": "low_mm", "95 % to": "high_mm", "one camera": "expected_of_one_mm",
-    }  # fmt: skip
-    rows = {f"{name} [um]": (1e3 * table[c]).map("{:.4g}".format) for name, c in um.items() if c in table}
-    rows["in pixels"] = table["rmse_offset_px"].map("{:.4g}".format)
-    rows |= {"p": table["p_value"].map("{:.2g}".format)} if "p_value" in table else {}
-    return pd.DataFrame(rows).T.reset_index(names="quantity")
+    """Tabulate the comparison as text, one column per method; lengths in micrometres."""
+    columns = {}
+    for row in stability_table(analyses, pixel_mm, noise_mm).to_dict("records"):
+        um = {str(k)[:-3]: 1e3 * value for k, value in row.items() if str(k).endswith("_mm")}
+        cells = {"RMSE_offset [um]": in_figures(um["rmse_offset"], 3)}
+        if "sigma" in um:
+            cells |= {
+                "RMSE_offset [um]": with_sigma(um["rmse_offset"], um["sigma"]), "sigma [um]": of_sigma(um["sigma"]),
+                "95 % interval [um]": f"{in_figures(um['low'], 2)} to {in_figures(um['high'], 2)}",
+                "expected of an unchanged camera [um]": with_sigma(um["expected_of_one"], um["sigma"]),
+                "p of an unchanged camera": of_p(row["p_value"]),
+            }  # fmt: skip
+        cells |= {
+            "RMSE_offset [px]": in_figures(row["rmse_offset_px"], 2),
+            "largest offset [um]": in_figures(um["largest"], 2),
+            "RMSE in the measured image [um]": in_figures(um["rmse_measured"], 2),
+            "within the noise": "yes" if row["similar"] else "no",
+        }  # fmt: skip
+        columns[row["method"]] = cells
+    return pd.DataFrame(columns).reset_index(names="quantity")
 
 
 def plot_ray_offsets(analysis: Analysis, sensor: Sensor, ax: Axes | None = None) -> Axes:
@@ -118,13 +129,13 @@ def print_stability(
     analyses: Mapping[Method, Analysis], sets: tuple[Compared, Compared], pixel_mm: float, noise_mm: float,
     method: Method, console: Console,
 ) -> None:  # fmt: skip
-    """Print both calibrations, one column per method, and the verdict by `method`."""
-    print_lines(about_sets(sets), console)
-    name = f"stability; noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px"
-    console.print(to_rich(by_method(analyses, pixel_mm, noise_mm), name))
+    """Print the verdict by `method`, one column per method, and both calibrations."""
     colour = "green" if analyses[method].similar(noise_mm) else "red"
     verdict = f"{method}: {analyses[method].verdict(noise_mm)}"
-    console.print(verdict, style=colour, highlight=False, markup=False, soft_wrap=True)
+    console.print(verdict, style=f"bold {colour}", highlight=False, markup=False, soft_wrap=True)
+    name = f"stability; noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px"
+    console.print(to_rich(by_method(analyses, pixel_mm, noise_mm), name))
+    print_lines(about_sets(sets), console)
 
 
 def write_stability(
@@ -134,12 +145,13 @@ def write_stability(
     """Write stability.csv, report.html and summary.json, and offsets.csv of `method`."""
     chosen = analyses[method]
     methods = "The bundles of rays are " + "; ".join(f"{ALIGNED[name]} ({name})" for name in analyses) + "."
+    # Write µm only in the report: a terminal may be unable to display it.
+    table = by_method(analyses, sensor.pixel_mm, noise_mm)
     parts: list[Part] = [
-        *map(Paragraph, about_sets(sets)), Heading("By method"), Paragraph(methods),
-        by_method(analyses, sensor.pixel_mm, noise_mm),
+        table.assign(quantity=table["quantity"].str.replace("[um]", "[µm]")), Paragraph(methods),
+        *map(Paragraph, about_sets(sets)), Heading("Offsets over the image"),
         Plot(partial(plot_ray_offsets, chosen, sensor), "offsets of the two bundles over the image", 4),
     ]  # fmt: skip
-    # Write µm only in the report: a terminal may be unable to display it.
     verdict = f"Bundles {ALIGNED[method]} ({method}): {chosen.verdict(noise_mm)}".replace(" um", " µm")
     v = chosen.offsets
     columns = ["x_mm", "y_mm", "dx_mm", "dy_mm", "dx_measured_mm", "dy_measured_mm"]
@@ -236,26 +248,27 @@ def plot_change(change: Change, sensor: Sensor, ax: Axes | None = None, *, over_
 
 
 def print_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor, console: Console) -> None:
-    """Print both calibrations, the parameters and the tests."""
-    print_lines(about_sets(sets), console)
+    """Print the verdict, the parameters, the tests and both calibrations."""
+    console.print(change_headline(change), style=f"bold {'yellow' if change.changed else 'green'}", soft_wrap=True)
     table = parameter_changes(change).drop(columns="ratio")
     if len(table := table[(table["sigma"] > 0) | (table["first"] != 0) | (table["second"] != 0)]):
         console.print(to_rich(table.rename(columns={"first": "A", "second": "B", "difference": "B - A"})))
-    print_lines(change_verdict(change, sensor), console)
+    print_lines([*change_verdict(change, sensor), *about_sets(sets)], console)
 
 
 def write_change(
     change: Change, sets: tuple[Compared, Compared], sensor: Sensor, directory: Path, record: CommandRecord
 ) -> None:
     """Write parameters.csv, cells.csv, report.html and summary.json."""
-    parameters, names = parameter_changes(change), {False: "offsets of rays [px]", True: "offsets over their limit"}
+    parameters = parameter_changes(change)
+    names = {False: "offsets of rays [px]", True: "offsets over their limit"}
+    shown = parameters.rename(columns={"first": "A", "second": "B", "difference": "B - A"})
     parts: list[Part] = [
+        shown,
         *(Paragraph(as_sentence(sentence)) for sentence in change_verdict(change, sensor)),
         *map(Paragraph, about_sets(sets)),
         Heading("Over the format"),
         [Plot(partial(plot_change, change, sensor, over_usual=u), f"map of {name}") for u, name in names.items()],
-        Heading("Parameters"),
-        parameters,
     ]
     tables = {"parameters": parameters, "cells": change_cells(change, sensor)}
     verdict, summary = (change_headline(change), "amber" if change.changed else "green"), change_summary(change, sensor)
@@ -347,6 +360,32 @@ def halves_verdict(halves: Halves) -> list[str]:
     return [*sentences, "errors common to both halves, such as those of fixed points, are undetectable"]
 
 
+def _estimates(halves: Halves) -> pd.DataFrame:
+    """Return the estimates of the camera with the standard deviations of `Halves.widened`."""
+    table = estimates_table(Tables(halves.adjusted))
+    table = table[table["parameter"].str.startswith(f"interior[{halves.camera}].")]
+    return table.assign(sigma=max(halves.band.factor, 1.0) * table["sigma"])
+
+
+def _factor_words(halves: Halves) -> str:
+    return f"a posteriori, times {max(halves.band.factor, 1.0):.2f} by the halves"
+
+
+def print_halves(halves: Halves, console: Console) -> None:
+    """Print the verdict, sigma naught and the estimates with their enlarged standard deviations."""
+    verdict = halves_verdict(halves)
+    console.print(plain(halves.adjusted.block.title or "block"), style="bold")
+    colour = {"amber": "yellow"}.get(_colour(halves), "green")
+    console.print(plain(verdict[0]), style=f"bold {colour}", soft_wrap=True)
+    print_sigma0(halves.adjusted, console)
+    console.print(to_rich(_estimates(halves), f"estimates ({_factor_words(halves)})"))
+    print_lines(verdict[1:], console)
+
+
+def _colour(halves: Halves) -> str:
+    return "amber" if abs(halves.band.factor - 1) > _SURE * halves.band.sigma_factor else "green"
+
+
 def plot_halves(halves: Halves, ax: Axes | None = None, *, band: bool = False) -> Axes:
     """Draw the factor of the standard deviations over the format, or the radius of the 95 % `band` (px)."""
     ax = axes_or_new(ax)
@@ -361,9 +400,13 @@ def write_halves(
 ) -> None:
     """Write cells.csv, cuts.csv, report.html, summary.json, and the camera by `write_camera`."""
     cuts, verdict, block = cut_table(halves), halves_verdict(halves), halves.adjusted.block
-    colour = "amber" if abs(halves.band.factor - 1) > _SURE * halves.band.sigma_factor else "green"
     names = {False: "factor of the standard deviations", True: "radius that holds 95 % of the errors"}
     parts: list[Part] = [
+        _estimates(halves),
+        Paragraph(
+            f"Standard deviations are {_factor_words(halves)} (sigma naught {float(halves.adjusted.sigma0):.4f}, "
+            f"redundancy {halves.adjusted.redundancy}), as in camera.toml."
+        ),
         *(Paragraph(as_sentence(sentence)) for sentence in verdict[1:]),
         *assumed_pixels(block.sensors),
         Heading("Over the format"),
@@ -382,5 +425,5 @@ def write_halves(
         write_camera(work)
         tables = {"cells": cell_table(halves), "cuts": cuts}
         write_study(
-            work, f"{block.title or 'block'}: halves", (verdict[0], colour), parts, summary, record, tables
+            work, f"{block.title or 'block'}: halves", (verdict[0], _colour(halves)), parts, summary, record, tables
         )  # fmt: skip

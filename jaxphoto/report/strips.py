@@ -19,13 +19,13 @@ from jaxphoto.observations import AttitudeSteps, PositionSteps
 from jaxphoto.procedures.lidar import StripAdjustment, StripDifference, StripRound
 from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL, SurveyedGap
 from jaxphoto.report.draws import in_degrees
-from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
+from jaxphoto.report.findings import Finding, Severity, Verdict, as_sentence, p_words
 from jaxphoto.report.formatting import label_unit, to_rich
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, verdict_parts
 from jaxphoto.report.plots import axes_or_new, draw_matrix, label, title
 from jaxphoto.report.results import write_results, write_study
-from jaxphoto.report.tables import Tables
-from jaxphoto.report.terminal import print_lines
+from jaxphoto.report.tables import Tables, about_sigma, initial_values
+from jaxphoto.report.terminal import print_lines, print_sigma0, print_verdict
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import LEVEL, correlation_matrix
 from jaxphoto.statistics.global_test import global_test
@@ -86,8 +86,11 @@ def gaps_table(before: Raster, after: Raster) -> pd.DataFrame:
 def calibration_table(result: StripAdjustment) -> pd.DataFrame:
     """Tabulate the parameters of scanner, cameras and mounts; angles in degrees.
 
-    Columns: parameter, value, sigma, with (the most correlated parameter), rho, unit.
+    Columns: parameter, initial (before the strips are used), value, sigma, unit, with (the most correlated parameter),
+    rho.
     """
+    # Only scanner parameters have no value before the adjustment; use zero.
+    initial = initial_values(result.before.unknowns) if result.before else {}
     covariance, s = result.covariance, result.adjusted.structure
     rho, sigma = correlation_matrix(covariance), np.asarray(covariance.shared_sigma)
     value = np.asarray(result.adjusted.values.shared)[s.free]
@@ -101,8 +104,9 @@ def calibration_table(result: StripAdjustment) -> pd.DataFrame:
         factor = 180 / np.pi if path.endswith("_rad") else 1.0
         name, unit = in_degrees(path), label_unit(in_degrees(path), result.adjusted.unknowns.interior)
         correlation = rho[first + k, first + other]
-        rows.append((name, factor * value[k], factor * sigma[k], in_degrees(s.labels[other]), correlation, unit))
-    return pd.DataFrame(rows, columns=["parameter", "value", "sigma", "with", "rho", "unit"])
+        estimate = initial.get(name, 0.0), factor * value[k], factor * sigma[k], unit
+        rows.append((name, *estimate, in_degrees(s.labels[other]), correlation))
+    return pd.DataFrame(rows, columns=["parameter", "initial", "value", "sigma", "unit", "with", "rho"])
 
 
 def trajectory_errors_table(result: StripAdjustment) -> pd.DataFrame:
@@ -337,7 +341,12 @@ def write_strips(
             "pattern": result.errors.calibration.pattern, **surveyed_summary(result),
             "seconds": seconds,
         }  # fmt: skip
-        parts = [*verdict_parts(verdict), *_sections(result, files, overlap)]
+        top = files["scanner"] if len(files["scanner"]) else files["trajectory_errors"][_SHIFTS]
+        pattern = _PATTERNS[result.errors.calibration.pattern]
+        words = f"{about_sigma(result.adjusted)} {as_sentence(_iterations(result))}"
+        if len(files["scanner"]):
+            words += f" Each estimate with its most correlated parameter (with, rho). {pattern}"
+        parts = [top, Paragraph(words), *verdict_parts(verdict), *_sections(result, files, overlap)]
         write_study(work, name, (verdict.headline, verdict.colour), parts, summary, record, files)
 
 
@@ -359,12 +368,7 @@ def _sections(
             "exceeds 3.3). surveyed_points.csv has all."
         )
         yield _in_tenths_of_mm(files["surveyed_points"].head(_SHOWN))
-    if len(scanner := files["scanner"]):
-        yield Heading("Scanner and cameras" if result.before else "Scanner")
-        pattern = _PATTERNS[result.errors.calibration.pattern]
-        yield Paragraph(f"Estimates, each with its most correlated parameter (with, rho). {pattern}")
-        yield scanner
-    if scanner["parameter"].str.startswith("scanner").any():
+    if files["scanner"]["parameter"].str.startswith("scanner").any():
         yield Heading("Correlations of the scanner")
         yield Paragraph(
             "Parameters with correlations near 1 or -1 are not separable. correlation.csv has all unknowns."
@@ -377,10 +381,10 @@ def _sections(
             for itself, words in ((False, "camera and mount"), (True, "itself"))
             if itself or not all(name.startswith(("scanner", TrajectoryKnot.kind)) for name in names)
         ]
-    if result.trajectory is None:
+    if result.trajectory is None and len(files["scanner"]):
         yield Heading("Shifts of the strips")
         yield files["trajectory_errors"][_SHIFTS]
-    else:
+    elif result.trajectory is not None:
         yield Heading("Errors of the trajectory")
         yield Paragraph(
             "Trajectory errors along each strip with bands of two standard deviations. Most of this uncertainty is a "
@@ -406,15 +410,23 @@ def _in_tenths_of_mm(table: pd.DataFrame) -> pd.DataFrame:
     return table.assign(**{str(name): numbers[name] for name in numbers})
 
 
-def print_strips(result: StripAdjustment, console: Console) -> None:
-    """Print iterations, gaps of strips, and the scanner."""
+def _iterations(result: StripAdjustment) -> str:
+    """Summarise the iterations."""
     last = result.rounds[-1]
     end = f"{'' if result.converged else 'not '}converged after {last.number} iterations"
     ties = f" and {last.points} tie points on them" if last.points else ""
     ties += f" and {last.control} of control" if last.control else ""
-    print_lines([f"{end}; {last.planes} planes{ties}, {last.left_out} rejected"], console)
-    console.print(to_rich(_in_tenths_of_mm(differences_table(result.differences)), "gaps of strips"))
-    if result.trajectory is None:
-        console.print(to_rich(trajectory_errors_table(result)[_SHIFTS], "shifts of strips"))
+    return f"{end}; {last.planes} planes{ties}, {last.left_out} rejected"
+
+
+def print_strips(result: StripAdjustment, verdict: Verdict, console: Console) -> None:
+    """Print the verdict, iterations, sigma naught, the estimates, and gaps of strips."""
+    print_verdict(verdict, console)
+    print_lines([_iterations(result)], console)
+    print_sigma0(result.adjusted, console)
     if len(table := calibration_table(result)):
-        console.print(to_rich(table, "scanner and cameras"))
+        console.print(to_rich(table, "scanner and cameras (a posteriori)"))
+    if result.trajectory is None:
+        console.print(to_rich(trajectory_errors_table(result)[_SHIFTS], "shifts of strips (a posteriori)"))
+    gaps = _in_tenths_of_mm(differences_table(result.differences))
+    console.print(to_rich(gaps[["one", "other", "planes", "rms_before_m", "rms_m", "noise_m"]], "gaps of strips"))

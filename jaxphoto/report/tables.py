@@ -18,7 +18,7 @@ from jaxphoto.arrays import ArrayLike
 from jaxphoto.camera import RATES, constant_names, get_parameter, parameter_names, parameter_unit
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES, AbstractObservations
-from jaxphoto.parameters import unit_of
+from jaxphoto.parameters import numbers_of, unit_of
 from jaxphoto.report.findings import symbol
 from jaxphoto.report.formatting import in_file_unit, label_unit
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
@@ -26,7 +26,7 @@ from jaxphoto.statistics.block_geometry import Coverage, coverage, intersection_
 from jaxphoto.statistics.correlation import FORMS
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
 from jaxphoto.tracing import refuse_traced
-from jaxphoto.unknowns import Weighted
+from jaxphoto.unknowns import Unknowns, Weighted
 
 # Median cosine of the tilt above which images are near-vertical (45 degrees).
 _NEAR_VERTICAL = 0.7
@@ -441,6 +441,44 @@ def convergence_table(adjusted: Adjustment) -> pd.DataFrame:
         "bent": np.where(history.bent > 0, history.bent, np.nan), "taken": np.where(history.accepted > 0, "yes", "no"),
     }  # fmt: skip
     return pd.DataFrame({name: pd.Series(values) for name, values in columns.items()}).fillna({"taken": ""})
+
+
+def estimates_table(tables: Tables, start: Unknowns | None = None) -> pd.DataFrame:
+    """Tabulate the estimated parameters of cameras, scanner, mounts and strips; angles in degrees.
+
+    Columns: parameter (path), initial (of `start`, by default of the block), value, sigma (a posteriori; NaN if not
+    converged), unit.
+    """
+    initial = initial_values(start or tables.adjusted.block.start.unknowns)
+    camera = tables.interior[tables.interior["sigma"].notna()]
+    paths = "interior[" + camera["camera"].astype(str) + "]." + camera["parameter"].astype(str)
+    table = pd.concat([camera.assign(parameter=paths), tables.georeferencing], ignore_index=True)
+    units = [label_unit(path, tables.adjusted.unknowns.interior) for path in table["parameter"]]
+    table = table.assign(initial=table["parameter"].map(initial), unit=np.array(units, object))
+    return table[["parameter", "initial", "value", "sigma", "unit"]]
+
+
+def about_sigma(adjusted: Adjustment) -> str:
+    """Describe the standard deviations of the estimates in a sentence."""
+    return (
+        f"Standard deviations are a posteriori (times sigma naught {float(adjusted.sigma0):.4f}, redundancy "
+        f"{adjusted.redundancy})."
+    )
+
+
+def initial_values(start: Unknowns) -> dict[str, float]:
+    """Return the values of all shared parameters by path; angles in degrees."""
+    values = {
+        f"interior[{name}].{p}": float(get_parameter(one, p))
+        for name, one in start.interior.items()
+        for p in parameter_names(one)
+    }
+    for owners in start.tables.values():
+        for owner, one in owners.items():
+            for path, value in zip(one.labels(owner), numbers_of(one), strict=True):
+                factor = 180 / np.pi if path.endswith(("_rad", "_rad_per_s")) else 1.0
+                values[path.replace("_rad", "_deg")] = factor * float(value)
+    return values
 
 
 def shown_interior(tables: Tables) -> pd.DataFrame:

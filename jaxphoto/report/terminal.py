@@ -4,6 +4,7 @@ import pandas as pd
 from rich.console import Console
 from rich.text import Text
 
+from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import counted, printable
 from jaxphoto.report.findings import MARKS, Verdict
 from jaxphoto.report.formatting import to_rich
@@ -38,15 +39,10 @@ def print_verdict(verdict: Verdict, console: Console) -> None:
 def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None:
     """Print the verdict on an adjustment, sigma naught, interior orientation, residuals and check points."""
     adjusted = tables.adjusted
-    n, u = sum(adjusted.n_observations.values()), sum(adjusted.n_unknowns.values())
     console.print(plain(adjusted.block.title or "block"), style="bold")
     print_verdict(verdict, console)
-    constraints = f" + {adjusted.n_constraints} constraints" if adjusted.n_constraints else ""
     console.print(f"{adjusted.outcome.value} ({int(adjusted.steps)} iterations)")
-    console.print(
-        f"sigma0 {float(adjusted.sigma0):.6g}   redundancy {adjusted.redundancy} = {n} observations{constraints} - {u} "
-        "unknowns"
-    )
+    print_sigma0(adjusted, console)
     shown = {
         "interior orientation (a posteriori)": shown_interior(tables)[tables.interior["sigma"].notna()],
         "mounts and strips (a posteriori)": tables.georeferencing.head(_PARAMETERS),
@@ -57,6 +53,16 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
     for name, table in shown.items():
         if len(table):
             console.print(to_rich(table, name))
+
+
+def print_sigma0(adjusted: Adjustment, console: Console) -> None:
+    """Print sigma naught and the redundancy."""
+    n, u = sum(adjusted.n_observations.values()), sum(adjusted.n_unknowns.values())
+    constraints = f" + {adjusted.n_constraints} constraints" if adjusted.n_constraints else ""
+    console.print(
+        f"sigma0 {float(adjusted.sigma0):.6g}   redundancy {adjusted.redundancy} = {n} observations{constraints} - {u} "
+        "unknowns"
+    )
 
 
 def print_components(components: VarianceComponents, console: Console) -> None:
