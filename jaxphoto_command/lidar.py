@@ -78,12 +78,12 @@ def lidar_control(
         result = lidar_control(read, points, method, settings, max_rounds=max_rounds, report=report)
         progress.update(f"writing {out}")
         heights, rounds = heights_table(result), rounds_table(result.rounds)
-        page = heights_page(result, output.command_record(block, cloud))
+        page = heights_page(result, read.start.unknowns, output.command_record(block, cloud))
         with whole_block(result.block, out) as folder:
             heights.to_csv(folder / "lidar_heights.csv", index=False)
             rounds.to_csv(folder / "lidar_rounds.csv", index=False)
             (folder / "report.html").write_text(page, encoding="utf-8")
-    print_control(result, output.screen)
+    print_control(result, read.start.unknowns, output.screen)
     rejected = flag_counts(result.flag[~np.isfinite(result.height)]).items()
     note = f" (rejected: {', '.join(f'{name.lower()} {n}' for name, n in rejected)})" if rejected else ""
     used = int(result.used.sum())
@@ -121,7 +121,7 @@ def roof_control(
         result = roof_control(read, points, settings, centroids=opt.names(centroids), **options)
         progress.update(f"writing {out}")
         write_block(result.block, out)
-    print_control(result, output.screen)
+    print_control(result, read.start.unknowns, output.screen)
     output.wrote(out, f"wrote {out}: {len(result.points)} tie points lie on {result.faces} roof faces")
     output.add(n_tie_points=len(result.points), n_roof_faces=result.faces)
     _end_of_rounds(output, result)

@@ -15,6 +15,7 @@ from rich.progress import Progress as Bar
 
 from jaxphoto.adjustment.iteration_log import log_iterations, step_lines
 from jaxphoto_command import app
+from jaxphoto_command import output as output_module
 from jaxphoto_command.output import Output, Progress
 from tests.blocks import adjusted
 from tests.commands import run
@@ -106,6 +107,18 @@ def test_verbose_logs_steps_iterations_and_compilations(capsys):
     course = [f"adjusted 10 images, {len(result.block.points)} points: {result.outcome.value}", *step_lines(result)]
     assert lines == ["reading", "features", *course, "compiled solve in 1.0 s"]
     assert not logging.getLogger("jaxphoto").handlers
+
+
+def test_a_compilation_is_noticed_while_it_lasts(monkeypatch):
+    monkeypatch.setattr(output_module, "_NOTICEABLE_S", 0.0)
+    seen = []
+    with output() as out:
+        seen.append(out._is_compiling)
+        jax.monitoring.record_scalar("/jax/core/compile/backend_compile_duration", 0.0, fun_name="f")
+        seen.append(out._is_compiling)
+        jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 0.1, fun_name="f")
+        seen.append(out._is_compiling)
+    assert seen == [False, True, False]
 
 
 def test_a_note_states_a_long_compile_time(capsys):

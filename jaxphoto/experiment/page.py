@@ -95,8 +95,8 @@ def experiment_page(run: Run, comparison: pd.DataFrame, record: CommandRecord | 
                 "consistent, and the difference is one of the simulated block from that of the paper."
             )
         shown = far.assign(table=far["table"].map(table_title), column=far["column"].map(head_of))
-        for name in ("ours", "published", "ratio", "expected"):
-            shown[name] = ["" if np.isnan(v) else f"{v:.3g}" for v in shown[name]]
+        for field in ("ours", "published", "ratio", "expected"):
+            shown[field] = ["" if np.isnan(v) else f"{v:.3g}" for v in shown[field]]
         parts += [Paragraph(words), without_empty(shown.fillna(""))]
     if len(judged):
         words = "Ours minus printed over the tolerance, by table: within it between the lines, crosses beyond"

@@ -25,6 +25,7 @@ from jaxphoto.report.results import summary_of, write_results, write_study
 from jaxphoto.report.tables import Tables, about_sigma, estimates_table
 from jaxphoto.report.terminal import plain, print_lines, print_sigma0, print_verdict
 from jaxphoto.statistics import Covariance, angle_differences, correlation_matrix
+from jaxphoto.unknowns import Unknowns
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
@@ -223,12 +224,15 @@ def print_simultaneous(result: Simultaneous, tables: Tables, verdict: Verdict, c
     console.print(to_rich(_root_mean_squares(moved)))
 
 
-def print_control(control: LidarControl | RoofControl, console: Console) -> None:
-    """Print the iterations, sigma naught and the estimates of an adjustment with control from a cloud."""
+def print_control(control: LidarControl | RoofControl, start: Unknowns, console: Console) -> None:
+    """Print the iterations, sigma naught and the estimates of an adjustment with control from a cloud.
+
+    `start`: unknowns of the block before.
+    """
     console.print(plain(control.block.title or "block"), style="bold")
     print_lines(rounds_words(control.rounds, control.converged), console)
     print_sigma0(control.adjusted, console)
-    if len(table := estimates_table(Tables(control.adjusted))):
+    if len(table := estimates_table(Tables(control.adjusted), start)):
         console.print(to_rich(table, "estimates (a posteriori)"))
 
 
@@ -251,8 +255,11 @@ def rounds_words(rounds: Sequence[Round], converged: bool) -> tuple[str, str]:
     )
 
 
-def heights_page(control: LidarControl, record: CommandRecord) -> str:
-    """Return the page of cloud heights as control: iterations, flags, plots, and the largest differences."""
+def heights_page(control: LidarControl, start: Unknowns, record: CommandRecord) -> str:
+    """Return the page of cloud heights as control: estimates, iterations, flags, plots, and the largest differences.
+
+    `start`: unknowns of the block before.
+    """
     heights = heights_table(control)
     heights.insert(5, "difference_m", heights["height_m"] - heights["Z_m"])
     largest = heights.sort_values("difference_m", key=np.abs, ascending=False, kind="stable")[:_ROWS]
@@ -264,7 +271,7 @@ def heights_page(control: LidarControl, record: CommandRecord) -> str:
         if control.used.any() or not r
     ]
     parts: list[Part] = [
-        estimates_table(Tables(control.adjusted)),
+        estimates_table(Tables(control.adjusted), start),
         *(Paragraph(as_sentence(text)) for text in (about_sigma(control.adjusted), words[1], used)),
         Heading("Over the ground"),
         plots,

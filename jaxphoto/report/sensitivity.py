@@ -28,6 +28,8 @@ from jaxphoto.writing import whole_folder
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+# Times of the adjustment in summary.json.
+_TIMES = ("compile", "solve", "covariance", "sensitivity")
 # Columns of the largest changes in summary.json.
 _LARGEST = ("unit", "axis", "exact", "first_order", "over_sigma", "estimate_unit")
 
@@ -348,5 +350,5 @@ def _summary(tables: SensitivityTables, seconds: dict[str, float]) -> dict:
         "title": adjusted.block.title, "bias_m": tables.bias_m, "per": tables.per, "delta0": tables.delta0,
         "sigma0": float(adjusted.sigma0), "redundancy": adjusted.redundancy, "check_points": len(tables.check),
         "unchecked_observations": {name: int((~np.isfinite(v)).sum()) for name, v in mdb.items()}, "interior": interior,
-        "seconds": rounded(seconds),
+        "seconds": rounded(seconds | {name: adjusted.seconds[name] for name in _TIMES}),
     }  # fmt: skip

@@ -99,7 +99,7 @@ def by_method(analyses: Mapping[Method, Analysis], pixel_mm: float, noise_mm: fl
                 "p of an unchanged camera": of_p(row["p_value"]),
             }  # fmt: skip
         cells |= {
-            "RMSE_offset [px]": in_figures(row["rmse_offset_px"], 2),
+            "in pixels": in_figures(row["rmse_offset_px"], 2),
             "largest offset [um]": in_figures(um["largest"], 2),
             "RMSE in the measured image [um]": in_figures(um["rmse_measured"], 2),
             "within the noise": "yes" if row["similar"] else "no",

@@ -454,7 +454,9 @@ def estimates_table(tables: Tables, start: Unknowns | None = None) -> pd.DataFra
     paths = "interior[" + camera["camera"].astype(str) + "]." + camera["parameter"].astype(str)
     table = pd.concat([camera.assign(parameter=paths), tables.georeferencing], ignore_index=True)
     units = [label_unit(path, tables.adjusted.unknowns.interior) for path in table["parameter"]]
-    table = table.assign(initial=table["parameter"].map(initial), unit=np.array(units, object))
+    numbers = {"initial": table["parameter"].map(initial), "value": table["value"], "sigma": table["sigma"]}
+    # Convert: without parameters of mounts and strips, the columns are objects.
+    table = table.assign(**{name: v.astype(float) for name, v in numbers.items()}, unit=np.array(units, object))
     return table[["parameter", "initial", "value", "sigma", "unit"]]
 
 

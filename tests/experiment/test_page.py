@@ -9,7 +9,15 @@ from matplotlib.figure import Figure
 
 from jaxphoto import Tables
 from jaxphoto.experiment import Experiment, Run, comparison_figure, plot_agreement, plot_comparison, side_by_side
-from jaxphoto.experiment.page import cell_words, experiment_page, heading, printed_table, table_title
+from jaxphoto.experiment.page import (
+    cell_words,
+    experiment_page,
+    far_apart,
+    heading,
+    not_judged,
+    printed_table,
+    table_title,
+)
 from tests.blocks import adjusted
 
 NAN = np.nan
@@ -43,6 +51,22 @@ def test_a_table_holds_both_values_units_and_judgement():
     table = printed_table(cells).set_index("row")
     assert table.index.tolist() == ["first", "third", "all"] and "c [mm]" in table
     assert 'class="no"' in table.loc["first", "sigma k1 mm-2 [mm^-2]"] and "✗" in table.loc["first"].iloc[1]
+
+
+def test_values_without_tolerance_are_counted_and_compared():
+    reasons = not_judged(COMPARISON)
+    assert reasons[["reason", "values"]].to_numpy().tolist() == [["the truth", 2]]
+    names = ["rmse_dZ_m", "rmse_dX_m", "mean_dZ_m", "expected_rmse_dZ_m", "rmse_dY_m"]
+    ours, printed = [0.134, 0.04, 0.03, 0.15, NAN], [0.054, 0.03, 0.001, NAN, 0.033]
+    cells = pd.DataFrame({"table": "table5", "row": "a", "column": names, "ours": ours, "published": printed})
+    cells = cells.assign(unit="m", tolerance=NAN, within="", note="", spread=0.01)
+    far = far_apart(cells)
+    assert far[["column", "expected"]].to_numpy().tolist() == [["rmse_dZ_m", 0.15]]
+    assert far["ratio"].iloc[0] == pytest.approx(0.134 / 0.054)
+    assert dict(zip(not_judged(cells)["reason"], not_judged(cells)["values"], strict=True)) == {
+        "no tolerance is published": 3, "not computed": 1,
+    }  # fmt: skip
+    assert 'class="far"' in printed_table(cells).loc[0, "rmse dZ [m]"]
 
 
 def test_side_by_side_keeps_the_order_of_the_print():
@@ -87,6 +111,7 @@ def test_plots_take_and_return_axes():
 def test_the_page_is_made_of_the_parts_of_all_pages():
     run = Run(Experiment("A paper", {}, {}), pd.DataFrame({"layout": [0, 1]}), {"first": Tables(adjusted("cross"))}, ())
     page = experiment_page(run, COMPARISON)
-    assert '<p class="verdict amber">2 of 3 printed values with a tolerance are within it' in page
+    assert '<p class="verdict amber">2 of 3 judged values within tolerance; 2 not judged' in page
+    assert page.count('<span class="no">') == 1 and "&lt;span" not in page
     assert all(f'<a href="#{name}">' in page for name in ("table-2-iops", "own", "block-of-the-first-layout"))
     assert 'querySelectorAll("table:has(thead)")' in page and not re.search(r'(src|href)="(?!data:|#)', page)

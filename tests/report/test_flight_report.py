@@ -8,12 +8,14 @@ import pytest
 from matplotlib.figure import Figure
 from matplotlib.quiver import Quiver
 
+from jaxphoto.camera import get_parameter
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.procedures.control import ControlledBlock
 from jaxphoto.procedures.control.marks import Marked
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.flight import (
     axis_cell,
+    flight_estimates,
     flight_page,
     flight_summary,
     offset_statistics,
@@ -41,6 +43,17 @@ def test_the_verdict_is_first_then_linked_contents_of_all_sections(page):
     assert sorted(begins) == list(begins) and begins[-1] < page.index("<h2")
     links = re.findall(r'<a href="#([^"]+)">([^<]+)</a>', page)
     assert links == re.findall(r'<h2 id="([^"]+)">([^<]+)</h2>', page) and len(dict(links)) == len(links) > 15
+
+
+def test_standard_deviations_of_the_camera_contain_the_factor_of_correlated_residuals():
+    report = part_report()
+    table = flight_estimates(report, BROWN).set_index("parameter")
+    interior = report.tables.interior.dropna(subset="sigma")
+    for one in interior.itertuples():
+        row = table.loc[f"interior[{one.camera}].{one.parameter}"]
+        assert row["sigma"] == pytest.approx(1.5 * one.sigma) and row["value"] == one.value
+        assert row["initial"] == float(get_parameter(BROWN, one.parameter))
+    assert len(interior) and len(table) == len(interior) + len(report.tables.georeferencing)
 
 
 def test_the_documentation_lists_the_sections_of_the_page(page):

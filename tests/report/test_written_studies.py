@@ -59,4 +59,4 @@ def test_pages_of_boresight_and_of_cloud_heights():
     text = page("Boresight", boresight_parts(boresight_steps()))
     assert text.count("<svg") == 2 and 'href="step_4/report.html"' in text
     control = lidar_control_of()
-    assert heights_page(control, MADE).count("<svg") == 2
+    assert heights_page(control, control.block.start.unknowns, MADE).count("<svg") == 2

@@ -160,5 +160,13 @@ def test_tables_and_command(tmp_path) -> None:
     assert summary["bias_m"] == 0.1
     assert "interior[kodak].c_mm" in summary["interior"]
     tables = SensitivityTables(adjust(read_block(EXAMPLES / "cross_block")), "block", 0.1)
+    # Sigmas and external reliability are those of the tables of the adjustment.
+    own, sigma = tables.tables, tables.tables.interior.set_index("parameter")["sigma"]
+    assert tables.sigma["interior[kodak].c_mm"] == pytest.approx(sigma["c_mm"], rel=1e-12)
+    largest = tables.external_reliability.set_index(["estimate", "group"])["effect_over_sigma"].abs()
+    control = own.residuals[own.residuals["group"] == "control_points"]
+    for name in ("c", "xp", "yp"):
+        effect = largest[f"interior[kodak].{name}_mm", "control_points"]
+        assert effect == pytest.approx(control[f"{name}_moves"].max(), rel=0.01)
     assert len(tables.check) == 20
     assert len(tables.bias) == 3 * (5 + 60)
