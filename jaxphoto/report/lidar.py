@@ -31,6 +31,8 @@ from jaxphoto.writing import whole_folder
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
 
+ITERATIONS = {"round": "iteration", "observed": "observations", "left_out": "rejected", "moved_m": "rms_motion_m"}
+"""Heads of the columns of iterations on a page."""
 # Maximum number of rows of a long table on a page.
 _ROWS = 30
 
@@ -194,7 +196,7 @@ def write_simultaneous(
             Heading("Points and surface of the cloud"),
             [Plot(partial(plot_above, result, before=b), f"points above the cloud {w}", 4)
              for b, w in ((True, "before"), (False, "after"))],
-            _root_mean_squares(moved), Heading("Iterations"), rounds.replace(np.inf, np.nan),
+            _root_mean_squares(moved), Heading("Iterations"), rounds.replace(np.inf, np.nan).rename(columns=ITERATIONS),
             Heading("Correlations of the scanner"),
             Paragraph("The strongest; all are in scanner_correlation.csv."), _strongest(correlations),
         ]  # fmt: skip
@@ -276,7 +278,7 @@ def heights_page(control: LidarControl, start: Unknowns, record: CommandRecord) 
         Heading("Over the ground"),
         plots,
     ]
-    parts += [Heading("Iterations"), rounds_table(control.rounds).replace(np.inf, np.nan)]
+    parts += [Heading("Iterations"), rounds_table(control.rounds).replace(np.inf, np.nan).rename(columns=ITERATIONS)]
     if flags := flag_counts(control.flag):
         parts.append(pd.DataFrame({"flag": [name.lower() for name in flags], "heights": list(flags.values())}))
     parts += [Heading("Largest differences"), without_empty(largest.round(3))]

@@ -130,7 +130,7 @@ def print_stability(
     method: Method, console: Console,
 ) -> None:  # fmt: skip
     """Print the verdict by `method`, one column per method, and both calibrations."""
-    colour = "green" if analyses[method].similar(noise_mm) else "red"
+    colour = "green" if analyses[method].similar(noise_mm) else "yellow"
     verdict = f"{method}: {analyses[method].verdict(noise_mm)}"
     console.print(verdict, style=f"bold {colour}", highlight=False, markup=False, soft_wrap=True)
     name = f"stability; noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px"

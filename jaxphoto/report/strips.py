@@ -21,6 +21,7 @@ from jaxphoto.procedures.lidar.strip_control import CHECK, CONTROL, SurveyedGap
 from jaxphoto.report.draws import in_degrees
 from jaxphoto.report.findings import Finding, Severity, Verdict, as_sentence, p_words
 from jaxphoto.report.formatting import label_unit, to_rich
+from jaxphoto.report.lidar import ITERATIONS
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, verdict_parts
 from jaxphoto.report.plots import axes_or_new, draw_matrix, label, title
 from jaxphoto.report.results import write_results, write_study
@@ -356,9 +357,8 @@ def _sections(
     yield Heading("Strips before and after")
     yield _in_tenths_of_mm(files["strips"])
     if gaps is not None:
-        limit = _limit(gaps[0])
         yield [
-            Plot(partial(plot_strip_differences, raster, limit_m=limit), f"gaps of strips over the ground, {when}", 4)
+            Plot(partial(plot_strip_differences, raster), f"gaps of strips over the ground, {when}", 4)
             for raster, when in zip(gaps, ("before", "after"), strict=True)
         ]
     if "surveyed_points" in files:
@@ -401,7 +401,7 @@ def _sections(
             for attitude in (False, True)
         ]
     yield Heading("Iterations")
-    yield files["rounds"]
+    yield files["rounds"].rename(columns=ITERATIONS)
 
 
 def _in_tenths_of_mm(table: pd.DataFrame) -> pd.DataFrame:
