@@ -153,6 +153,8 @@ _BY_OTHERS = {
     "gap_m": ("sigma_m",),
 }
 _SIGMAS = ("sd", "predicted_sigma", "worst_px")
+# A number as text.
+_NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 # Columns of parameters and their paths; columns of a table that replace the units of parameters.
 _PATHS, _PATH = ("parameter", "estimate", "parameter_a", "parameter_b", "with"), re.compile(r".+\]\.\w+$|[a-z_]+\.\w+$")
 _HAS_UNIT = {"unit", "rho", "estimate_unit"}
@@ -232,10 +234,11 @@ def numeric_columns(table: pd.DataFrame) -> list[bool]:
 
 def to_rich(table: pd.DataFrame, title: str = "") -> Table:
     """Convert a table for the terminal, numeric columns right-aligned."""
-    shown = Table(title=title or None)
+    shown, texts = Table(title=title or None), readable(table)
     for name, number in zip(table.columns, numeric_columns(table), strict=True):
+        number |= all(map(_NUMBER.fullmatch, texts[name]))
         shown.add_column(head_of(str(name)), justify="right" if number else "left")
-    for row in readable(table).itertuples(index=False, name=None):
+    for row in texts.itertuples(index=False, name=None):
         shown.add_row(*(Text(printable(cell)) for cell in row))
     return shown
 

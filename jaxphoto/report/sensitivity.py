@@ -83,6 +83,12 @@ class SensitivityTables:
         sigma |= {f"points[{p}].{a}": at[points.index(p), k] for p in self.check for k, a in enumerate(AXES)}
         return pd.Series([sigma.get(name, np.nan) for name in self._estimates], self._estimates).where(lambda v: v > 0)
 
+    def in_order(self, table: pd.DataFrame) -> pd.DataFrame:
+        """Return the rows of the interior parameters in the order of the estimates."""
+        place = {name: k for k, name in enumerate(self._estimates)}
+        rows = table[table["estimate"].str.startswith("interior")]
+        return rows.sort_values("estimate", key=lambda names: names.map(place), kind="stable")
+
     @cached_property
     def bias(self) -> pd.DataFrame:
         """Effects of the station bias.
@@ -239,7 +245,8 @@ def effects_by_unit(tables: SensitivityTables) -> pd.DataFrame:
         chosen = bias[bias["estimate"].isin(names)].groupby(["unit", "axis"], sort=False)["exact"]
         if len(names) == 1 and names[0].startswith("interior"):
             head = f"{path_words(title).partition(' [')[0]} [sigma]"
-            columns[head] = (chosen.sum() / tables.sigma[names[0]]).map("{:.2f}".format)
+            # Avoid a minus sign before zeros.
+            columns[head] = ((chosen.sum() / tables.sigma[names[0]]).round(2) + 0.0).map("{:.2f}".format)
         else:
             columns[title] = chosen.agg(_rms).map("{:.4f}".format)
     return pd.DataFrame(columns).reset_index(names=[tables.per, "axis"])
@@ -247,9 +254,8 @@ def effects_by_unit(tables: SensitivityTables) -> pd.DataFrame:
 
 def contributions(tables: SensitivityTables) -> pd.DataFrame:
     """Tabulate the variance fractions of the interior parameters as text, one column per group of observations."""
-    shares = tables.variance_shares
     rows = []
-    for path, of in shares[shares["estimate"].str.startswith("interior")].groupby("estimate", sort=False):
+    for path, of in tables.in_order(tables.variance_shares).groupby("estimate", sort=False):
         worst = of.iloc[int(of["largest_share"].to_numpy().argmax())]
         rows.append({
             "parameter": path_words(str(path)).partition(" [")[0],
@@ -264,14 +270,13 @@ def reliability(tables: SensitivityTables) -> pd.DataFrame:
 
     Columns: parameter, observation, r, MDB, effect [sigma].
     """
-    table = tables.external_reliability
     return pd.DataFrame([
         {
             "parameter": path_words(row["estimate"]).partition(" [")[0], "observation": _observation(row),
             "r": f"{row['redundancy_number']:.3f}", "MDB": f"{in_figures(row['detectable'], 3)} {row['unit']}",
             "effect [sigma]": f"{row['effect_over_sigma']:.2f}",
         }
-        for row in table[table["estimate"].str.startswith("interior")].to_dict("records")
+        for row in tables.in_order(tables.external_reliability).to_dict("records")
     ])  # fmt: skip
 
 
