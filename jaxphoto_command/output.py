@@ -32,7 +32,7 @@ class Progress:
     """Progress of a long operation: a line on a terminal, or log records with --verbose."""
 
     def __init__(self, bar: "Bar", description: str) -> None:
-        self._bar, self._task, self._description = bar, bar.add_task(""), ""
+        self._bar, self._task, self._description = bar, bar.add_task("", total=None), ""
         self.update(description)
 
     def update(self, description: str) -> None:

@@ -243,7 +243,7 @@ def _misalignment(adjusted: Adjustment, cov: Covariance, parameters: _SharedPara
         labels = {axis: f"mounts[{mount}].boresight_{axis}_rad" for axis in _ANGLES}
         angles = {_ANGLES[axis]: (parameters.value[label], parameters.sigma[label]) for axis, label in labels.items()}
         large = [name for name, (value, sigma) in angles.items() if abs(value) > SIGNIFICANT * sigma]
-        judged = f"significant in {', '.join(large)}" if large else "not significant"
+        judged = f"significant: {', '.join(large)}" if large else "not significant"
         messages.append(f"misalignment of mount {mount}: {judged}")
     rho, a, b = _strongest(cov, lambda x: "].boresight_" in x, lambda x: x.endswith(("].xp_mm", "].yp_mm")))
     if not a:
