@@ -17,8 +17,8 @@ from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.flight import CalibratedFlight, FlightPart
 from jaxphoto.report.certificate import known_conditions
-from jaxphoto.report.findings import Finding, Verdict, as_sentence, symbol
-from jaxphoto.report.formatting import plus_minus, without_empty
+from jaxphoto.report.findings import Finding, Verdict, as_sentence
+from jaxphoto.report.formatting import plus_minus, symbol, without_empty
 from jaxphoto.report.page import (
     CommandRecord,
     Heading,

@@ -16,8 +16,8 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
 from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.procedures.adjust import left_out_words
-from jaxphoto.report.findings import Finding, Severity, Verdict, p_words, symbol
-from jaxphoto.report.formatting import of_sigma, plus_minus
+from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
+from jaxphoto.report.formatting import of_sigma, plus_minus, symbol
 from jaxphoto.report.residual_findings import NOTHING_FITS, reliability_findings, residual_findings, stretch_findings
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import (
