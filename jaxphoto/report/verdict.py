@@ -72,7 +72,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         yield from _not_converged(adjusted)
         # Stop here: statistics are valid only at an optimum.
         return
-    prepare_hat_matrix(adjusted.equations, adjusted.seconds)
+    prepare_hat_matrix(adjusted)
     yield from (Finding("prior_information", "warning", doubt) for doubt in adjusted.block.prior_warnings)
     if adjusted.left_out:
         yield Finding("rejected", "warning", left_out_words(adjusted))
