@@ -5,11 +5,9 @@ cache on disk.
 """
 
 import contextlib
-import importlib
 import os
-import pkgutil
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 # SciPy's OpenBLAS, which JAX uses for LAPACK, spins threads that fight XLA's own pool (docs/solver.md).
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
@@ -51,6 +49,7 @@ from jaxphoto.camera.projection import PROJECTIONS
 from jaxphoto.collinearity import ExteriorOrientation, image_ray, intersect, project
 from jaxphoto.errors import BlockError, DatumError, InputError, JaxphotoError, RankError
 from jaxphoto.georeferencing import Corrections, Exposure, Mount, StripBias, Surface, direct_orientation, ground_point
+from jaxphoto.later import later
 from jaxphoto.observations import (
     AbstractObservations,
     Attitudes,
@@ -109,48 +108,5 @@ __all__ = [
     "write_block", "write_simulation",
 ]  # fmt: skip
 
-# Imported at first use: files and tables require pandas, which takes 0.3 s to import. Names by package, as imported
-# above for type checkers.
-_LATER = {
-    "extras.formats": ("convert", "read_source"),
-    "io": ("read_block", "read_recipe", "write_block", "write_simulation"),
-    "procedures.adjust": ("adjust",),
-    "procedures.boresight": ("boresight",),
-    "procedures.calibration": ("calibrate",),
-    "procedures.compare": ("compare", "halves"),
-    "procedures.georeference": ("georeference",),
-    "procedures.lidar": ("simultaneous",),
-    "procedures.orientation": ("orient",),
-    "procedures.robust": ("robust",),
-    "procedures.snooping": ("snoop",),
-    "report": ("Tables",),
-    "sensitivity": ("bias", "monte_carlo", "readjust"),
-    "simulation": ("simulate",),
-    "statistics": (
-        "Selection",
-        "angle_differences",
-        "covariance",
-        "point_differences",
-        "significance",
-        "variance_components",
-    ),
-    "statistics.sigma_map": ("sigma_map",),
-}
-
-
-def __getattr__(name: str) -> Any:
-    for room, names in _LATER.items():
-        if name in names:
-            return getattr(importlib.import_module(f"jaxphoto.{room}"), name)
-    if name in _rooms():
-        return importlib.import_module(f"jaxphoto.{name}")
-    raise AttributeError(f"module 'jaxphoto' has no attribute {name!r}")
-
-
-def __dir__() -> list[str]:
-    """Return the names of the package and its subpackages, for tab completion."""
-    return sorted({*__all__, *_rooms(), "__version__"})
-
-
-def _rooms() -> set[str]:
-    return {module.name for module in pkgutil.iter_modules(__path__)}  # noqa: F405
+# Files and tables require pandas, which takes 0.3 s to import.
+__getattr__, __dir__ = later(__name__)

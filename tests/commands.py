@@ -36,7 +36,7 @@ def run(monkeypatch, capsys, *arguments, pictures: bool = False) -> tuple[int, s
 def _drawn(plot: page.Plot) -> Markup:
     """A picture that is drawn and not rendered."""
     if callable(plot.figure):
-        plot.figure(page.new_figure(4.8, plot.height).subplots())
+        plot.figure(plots.new_figure(4.8, plot.height).subplots())
     return Markup('<figure role="img" aria-label="{}"><svg></svg></figure>').format(plot.alt)
 
 

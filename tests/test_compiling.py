@@ -270,7 +270,7 @@ def test_a_jaxlib_without_an_option_is_not_given_it(kept, monkeypatch):
     monkeypatch.setattr(options, "_ADJUSTMENT", real | {"xla_no_such_option": True})
     assert options.options_here() == real
     first = run_compiled(root, (MATRIX, 2), {}, "run")[0]["root"]
-    monkeypatch.setattr(options, "_is_known", lambda name, value: False)
+    monkeypatch.setattr(options, "_are_known", lambda options: False)
     assert options.options_here() == options.quick_to_compile() == {}
     run._programs.clear()
     again = run_compiled(root, (MATRIX, 2), {}, "run")[0]["root"]

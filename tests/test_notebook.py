@@ -30,9 +30,9 @@ from jaxphoto.stability import Change
 from tests.blocks import adjusted, simulated
 
 PANELS = (
-    "plot_residuals", "plot_mean_residuals", "plot_density", "plot_check_points", "plot_interior_correlation",
+    "plot_residuals", "plot_mean_residuals", "plot_check_points", "plot_interior_correlation",
     "plot_exterior_correlation", "plot_sigma_map", "plot_distortion", "plot_error_ellipses", "plot_residuals_by_radius",
-    "plot_station_residuals", "plot_distortion_band", "plot_convergence", "plot_intersection_angles",
+    "plot_station_residuals", "plot_convergence", "plot_intersection_angles",
     "plot_overlap", "plot_links",
 )  # fmt: skip
 
@@ -232,7 +232,7 @@ def test_a_block_is_drawn_as_it_starts_and_as_it_ended(axes):
     np.testing.assert_array_equal(np.stack(stations.get_data(), 1), result.unknowns.exterior.position[:, :2])
     before = Figure().add_subplot()
     simulated("cross").block.plot(ax=before)
-    assert "before" in before.get_title()
+    assert "before" in before.get_title(loc="left")
     start = next(line for line in before.lines if line.get_label() == "control points")
     assert len(start.get_xdata()) == len(np.unique(result.block.control.who))
 

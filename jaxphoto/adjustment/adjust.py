@@ -217,7 +217,7 @@ def _layout_key(block: Block, priors: Unknowns, observed: ObservedRows) -> Hasha
 
 def _factored_like(values: PaddedValues, structure: PaddedStructure) -> FactoredNormal:
     """Return abstract arrays of the right types, without allocating memory."""
-    zero = zero_increments(structure)
+    zero = jax.eval_shape(lambda: zero_increments(structure))
     system = jax.eval_shape(zero_system, zero, values, structure)
     reduced, factor, scale = jax.tree.map(
         lambda v: np.broadcast_to(0.0, v.shape), (system.reduced, system.factor, zero)

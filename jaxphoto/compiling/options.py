@@ -45,14 +45,16 @@ def options_here(thorough: bool = False) -> Options | None:
 
 
 def _known(options: Options) -> Options:
-    return {name: value for name, value in options.items() if _is_known(name, value)}
+    """Return the options that this jaxlib accepts."""
+    pairs = tuple(options.items())
+    return options if _are_known(pairs) else dict(pair for pair in pairs if _are_known((pair,)))
 
 
 @functools.cache
-def _is_known(name: str, value: bool | int | str) -> bool:
-    """Return True if this jaxlib accepts the option, tested with an empty program."""
+def _are_known(options: tuple[tuple[str, bool | int | str], ...]) -> bool:
+    """Return True if this jaxlib accepts the options, tested with an empty program."""
     try:
-        jax.jit(lambda: 0, compiler_options={name: value}).lower().compile()
+        jax.jit(lambda: 0, compiler_options=dict(options)).lower().compile()
     except jax.errors.JaxRuntimeError:
         return False
     return True

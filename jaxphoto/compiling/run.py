@@ -42,7 +42,7 @@ MOST = 100
 _programs: dict[object, _Program] = {}
 _gone = 0
 """Number of programs dropped since the last `jax.clear_caches`."""
-_prepared: dict[object, Future[_Program]] = {}
+_prepared: dict[object, Future[_Program | None]] = {}
 _workers = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="jaxphoto-compile")
 keep_freed_memory()
 
@@ -64,6 +64,8 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
         program = prepared.result()
     elif program is None:
         program = _program_of(function.__wrapped__, arguments, thorough)()
+    if program is None:
+        program = _compilation_of(function.__wrapped__, arguments, thorough)()
     _keep(key, program)
     ready = time.perf_counter()
     try:
@@ -72,7 +74,7 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
         # A valid file may still fail on this machine: this appears only in the call, as various errors.
         if not program.loaded:
             raise
-        program = _program_of(function.__wrapped__, arguments, thorough, recompile=True)()
+        program = _compilation_of(function.__wrapped__, arguments, thorough)()
         _keep(key, program)
         ready = time.perf_counter()
         result = program(arrays)
@@ -87,7 +89,7 @@ def call_compiled(function: Any, *arguments: Any, thorough: bool = False) -> Any
 
 
 def prepare(function: Any, arguments: tuple, seconds: dict[str, float]) -> bool:
-    """Compile `function` in the background for a later `run_compiled` with arguments of these types.
+    """Load or compile `function` in the background for a later `run_compiled` with arguments of these types.
 
     Adds to `seconds["compile"]` the time that the caller waits. Returns True if anything is left to compile.
     """
@@ -139,18 +141,28 @@ def _type(array: Any) -> tuple:
     return array.shape, array.dtype, array.weak_type, array.sharding if array.committed else None
 
 
-def _program_of(function: Any, arguments: tuple, thorough: bool, recompile: bool = False) -> Callable[[], _Program]:
-    """Return a function that returns the program: loaded from disk, or compiled and stored (always with `recompile`).
+def _program_of(function: Any, arguments: tuple, thorough: bool) -> Callable[[], _Program | None]:
+    """Return a function that loads the program from disk (None if it is invalid), or compiles and stores it.
 
     All steps that depend on the thread, such as `with jax.enable_x64(False)`, are completed before this returns.
     """
+    key = store.key_of(function, arguments, options_here(thorough))
+    content = store.read(key) if key else None
+    if content is None:
+        return _compilation_of(function, arguments, thorough)
+
+    def loaded() -> _Program | None:
+        stored = store.load(content)
+        return_freed_memory()
+        return stored and _Program(stored.compiled, *jax.tree.flatten(stored.skeleton), loaded=True)
+
+    return loaded
+
+
+def _compilation_of(function: Any, arguments: tuple, thorough: bool) -> Callable[[], _Program]:
+    """Return a function that compiles and stores the program."""
     options = options_here(thorough)
     key = store.key_of(function, arguments, options)
-    stored = store.load(key) if key and not recompile else None
-    if stored is not None:
-        program = _Program(stored.compiled, *jax.tree.flatten(stored.skeleton), loaded=True)
-        return_freed_memory()
-        return lambda: program
     lowered, skeleton = _lowered(function, arguments)
 
     def compiled() -> _Program:

@@ -65,12 +65,14 @@ def key_of(function: Any, arguments: tuple, options: dict | None) -> str | None:
     return hashlib.sha256("\n".join(parts).encode()).hexdigest()
 
 
-def load(key: str) -> Stored | None:
-    """Load the program stored under `key`; None if there is none, or it is invalid."""
+def read(key: str) -> bytes | None:
+    """Read the file of the program `key`; None if there is none."""
     folder = _folder()
-    content = private_folder.read(folder, key) if folder is not None else None
-    if content is None:
-        return None
+    return private_folder.read(folder, key) if folder is not None else None
+
+
+def load(content: bytes) -> Stored | None:
+    """Load the program in a file; None if it is invalid."""
     try:
         # A program calls LAPACK by pointers that JAX sets when it lowers such a call; no call is lowered here.
         lapack.prepare_lapack_call("potrf", np.dtype(float))

@@ -14,7 +14,7 @@ from jaxphoto.io.text_tables import read_csv
 from jaxphoto.io.toml import read_toml
 from jaxphoto.writing import InputFile, input_file
 
-SUMMARY, INPUTS = "summary.json", "inputs.csv"
+SUMMARY, INPUTS, TRUTH = "summary.json", "inputs.csv", "truth"
 # Columns of text: ids may look like numbers, and image 0012 is not image 12.
 _TEXT = dict.fromkeys(
     (
@@ -38,6 +38,11 @@ def read_result_tables(folder: str | Path, names: Sequence[str] = ()) -> dict[st
     if missing := [name for name in names if name not in files]:
         raise InputError(f"{folder} has no table {missing[0]}; it has {', '.join(files)}")
     return {name: read_table(files[name]) for name in names or files}
+
+
+def read_truth(folder: str | Path) -> dict[str, pd.DataFrame]:
+    """Read the true values in the folder of a block; empty if the block was not simulated."""
+    return {path.stem: read_table(path) for path in sorted((Path(folder) / TRUTH).glob("*.csv"))}
 
 
 def read_table(path: Path) -> pd.DataFrame:

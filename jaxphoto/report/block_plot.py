@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float, Int
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block
 from jaxphoto.errors import counted
-from jaxphoto.report.plots import axes_or_new
+from jaxphoto.report.plots import axes_or_new, title
 from jaxphoto.tracing import outside_transformations
 
 if TYPE_CHECKING:
@@ -124,9 +124,9 @@ def plot_block(source: Block | Adjustment, ax: Axes | None = None, *, in_3d: boo
         axes.set(zlabel="Z [m]", aspect="equal")
     else:
         ax.set_aspect("equal", adjustable="datalim")
-    ax.set_title(f"block layout{'' if isinstance(source, Adjustment) else ', before adjustment'}", fontsize=10)
+    title(ax, f"block layout{'' if isinstance(source, Adjustment) else ', before adjustment'}")
     if ax.get_legend_handles_labels()[0]:
-        ax.legend(fontsize=8)
+        ax.legend(fontsize=7)
     return ax
 
 

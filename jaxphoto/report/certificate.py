@@ -15,8 +15,8 @@ from jaxtyping import Float
 from jaxphoto.camera import InteriorOrientation, Sensor, constant_names, get_parameter, parameter_names, parameter_unit
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.errors import camera_words
-from jaxphoto.report.findings import as_sentence, symbol
-from jaxphoto.report.formatting import of_sigma, with_sigma
+from jaxphoto.report.findings import as_sentence
+from jaxphoto.report.formatting import of_sigma, symbol, with_sigma
 from jaxphoto.report.page import Heading, Paragraph, Part, Plot, hash_table, option_word, page
 from jaxphoto.report.plots import draw_distortion, draw_format_map, draw_matrix
 from jaxphoto.report.results import assumed_pixels

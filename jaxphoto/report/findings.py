@@ -14,7 +14,7 @@ from typing import Any, Literal
 import pandas as pd
 
 from jaxphoto.errors import camera_words
-from jaxphoto.report.formatting import of_p, without_powers
+from jaxphoto.report.formatting import of_p, symbol, without_powers
 
 Severity = Literal["error", "warning", "note"]
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -22,7 +22,6 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """
 COLOURS: dict[Severity, str] = {"error": "red", "warning": "amber", "note": "green"}
 MARKS: dict[Severity, str] = {"error": "!!", "warning": "!", "note": "-"}
-_SYMBOLS = {"c_mm": "c", "xp_mm": "x_p", "yp_mm": "y_p"}
 _DECLARED: dict[str, dict[str, str]] = tomllib.loads(
     (files("jaxphoto.report") / "templates" / "findings.toml").read_text(encoding="utf-8")
 )
@@ -119,11 +118,6 @@ def as_sentence(text: str) -> str:
     first = text.split(maxsplit=1)[0] if text.strip() else ""
     start = text if len(first) == 1 or re.search(r"[_\d]", first) else f"{text[:1].upper()}{text[1:]}"
     return start if start.endswith((".", "!", "?")) else f"{start}."
-
-
-def symbol(parameter: str) -> str:
-    """Return the symbol of a parameter, such as c for c_mm."""
-    return _SYMBOLS.get(parameter, parameter)
 
 
 def in_symbols(text: str) -> str:

@@ -86,6 +86,8 @@ _UNITS = {
     "per_h": "1/h", "mm_per_K": "mm/K", "per_K": "1/K", "deg": "deg", "rad": "rad", "mm": "mm", "ms": "ms",
     "m": "m", "s": "s", "px": "px", "cm": "cm", "ppm": "ppm",
 }  # fmt: skip
+# The principal point, of which names leave out the underscore.
+_PRINCIPAL_POINT = re.compile(r"\b([xy]) ?p\b")
 _UNIT = re.compile(r"_(" + "|".join(_UNITS) + r")$")
 
 
@@ -93,6 +95,11 @@ def without_unit(name: str) -> tuple[str, str]:
     """Split a name and its unit: sigma_X_m gives ("sigma_X", "m"). The unit is "" if there is none."""
     unit = _UNIT.search(name)
     return (name[: unit.start()], _UNITS[unit[1]]) if unit else (name, "")
+
+
+def symbol(parameter: str) -> str:
+    """Return the symbol of a parameter without its unit: c for c_mm, x_p for xp_mm."""
+    return head_of(without_unit(parameter)[0])
 
 
 # Owners of parameters, by the first part of a path.
@@ -107,9 +114,10 @@ def path_words(path: str) -> str:
 
 
 def head_of(name: str) -> str:
-    """Return a column's name with its unit in brackets: "sigma X [m]" for sigma_X_m."""
+    """Return a column's name with its unit in brackets: "sigma X [m]" for sigma_X_m, "x_p [mm]" for xp_mm."""
     words, unit = without_unit(name)
-    return words.replace("_", " ") + (f" [{unit}]" if unit else "")
+    words = _PRINCIPAL_POINT.sub(r"\1_p", words.replace("_", " "))
+    return words + (f" [{unit}]" if unit else "")
 
 
 def label_unit(label: str, cameras: Mapping[str, InteriorOrientation]) -> str:
@@ -149,7 +157,7 @@ _BY_SD = ("nominal", "mean", "q025", "q50", "q975")
 # Columns whose standard deviation has a different name; of several columns the largest value is used.
 _BY_OTHERS = {
     **dict.fromkeys(("column_px", "row_px", "d_column_px", "d_row_px"), ("sigma_px",)),
-    **{f"d{a}_m": (f"sigma_survey_{a}_m", f"sigma_adjusted_{a}_m") for a in "XYZ"},
+    **{f"d{a}_m": (f"sigma_survey_{a}_m", f"sigma_adjusted_{a}_m", f"sigma_{a}_m") for a in "XYZ"},
     "gap_m": ("sigma_m",),
 }
 _SIGMAS = ("sd", "predicted_sigma", "worst_px")
@@ -184,7 +192,7 @@ def readable(table: pd.DataFrame) -> pd.DataFrame:
 def _texts(table: pd.DataFrame, name: str) -> list[str]:
     column = table[name]
     if name in _PATHS and not pd.api.types.is_numeric_dtype(column):
-        words = [path_words(v) if without_unit(v)[1] or _PATH.match(v) else v for v in column.astype(str)]
+        words = [path_words(v) if _PATH.match(v) else head_of(v) for v in column.astype(str)]
         # Correlations have no unit; a table may have a column of units instead.
         return [word.partition(" [")[0] for word in words] if _HAS_UNIT & set(table.columns) else words
     if name == "group":

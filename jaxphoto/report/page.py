@@ -8,6 +8,7 @@ from __future__ import annotations
 import base64
 import datetime
 import io
+import math
 import re
 import shutil
 import subprocess
@@ -25,7 +26,6 @@ from markupsafe import Markup
 from jaxphoto.errors import InputError
 from jaxphoto.report.findings import Verdict, as_sentence
 from jaxphoto.report.formatting import head_of, numeric_columns, readable
-from jaxphoto.report.plots import new_figure
 from jaxphoto.writing import InputFile
 
 if TYPE_CHECKING:
@@ -37,8 +37,22 @@ _PACKAGES = ("jaxphoto", "jax", "optimistix", "equinox", "lineax", "numpy", "pan
 _BROWSERS = ("chromium", "chromium-browser", "google-chrome", "chrome", "msedge")
 # Pattern of cells that are right-aligned: a value, with its unit or standard deviation.
 _NUMBER = re.compile(r"(< ?)?[-+]?(\d|-$)")
+_DECIMAL = re.compile(r"[-+]?\d+(\.\d+)?")
 # Settings of SVG: text stays text; a constant hash salt and no date, so that equal inputs give equal bytes.
-_SVG: dict[Any, Any] = {"svg.fonttype": "none", "svg.hashsalt": "jaxphoto"}
+_SVG: dict[Any, Any] = {
+    "svg.fonttype": "none", "svg.hashsalt": "jaxphoto", "font.size": 8.0, "xtick.labelsize": 7.5,
+    "ytick.labelsize": 7.5, "lines.linewidth": 1.2,
+}  # fmt: skip
+# Margins of a panel (inches): left, right, bottom, top; right of a second axis or colour bar.
+_MARGINS, _RIGHT = (0.6, 0.1, 0.45, 0.3), 0.5
+# Maximum number of intervals between the ticks of an axis.
+_TICKS = 5
+# Minimum length of a cell that is a text, and wraps.
+_LONG = 40
+# Absolute correlation beyond which text is white.
+_DARK = 0.6
+# Width of a panel (inches): three fit side by side.
+_WIDTH = 3.2
 _NO_METADATA: dict[str, Any] = dict.fromkeys(("Creator", "Date", "Format", "Type"))
 
 
@@ -61,8 +75,22 @@ class Plot(NamedTuple):
     figure: Figure | Callable[[Axes], object] | Path
     alt: str
     """Description for screen readers."""
-    height: float = 3.4
-    """Height of a panel (inches); its width is 4.8 inches."""
+    height: float = 2.6
+    """Height of a panel (inches); its width is 3.2 inches."""
+
+
+class Matrix(NamedTuple):
+    """Correlations, in columns of floats, shown as coloured cells; other columns name the rows."""
+
+    table: pd.DataFrame
+    caption: str
+
+
+class Folded(NamedTuple):
+    """Parts under a heading that are shown on demand, and not printed."""
+
+    text: str
+    parts: Sequence[Part]
 
 
 class Link(NamedTuple):
@@ -79,9 +107,11 @@ class PictureFile(NamedTuple):
     file: str
 
 
-Part = Heading | Paragraph | pd.DataFrame | dict[str, str] | Plot | list[Plot] | Link | PictureFile | Markup
-"""A part of a page. A dict is a list of names and values, a list of plots is drawn side by side, Markup is unchanged.
-"""
+Part = (
+    Heading | Paragraph | pd.DataFrame | Matrix | dict[str, str] | Plot | list[Plot] | list[Matrix] | Link
+    | PictureFile | Folded | Markup
+)  # fmt: skip
+"""A part of a page. A dict is a list of names and values, a list is side by side, Markup is unchanged."""
 
 
 class CommandRecord(NamedTuple):
@@ -125,43 +155,103 @@ def html(part: Part) -> Markup:
     if isinstance(part, Plot):
         return Markup('<div class="wide">{}</div>').format(_svg(part))
     if isinstance(part, list):
-        return Markup('<div class="plots">{}</div>').format(Markup("").join(map(_svg, part)))
+        return Markup('<div class="beside">{}</div>').format(
+            Markup("").join(_svg(one) if isinstance(one, Plot) else html(one) for one in part)
+        )
     if isinstance(part, dict):
         return Markup(_TEMPLATES.get_template("table.html").render(names=part))
-    shown = readable(part)
-    kinds = [
-        "number" if number or _mostly_numbers(shown.iloc[:, k]) else "text"
-        for k, number in enumerate(numeric_columns(part))
+    if isinstance(part, Folded):
+        inside = Markup("").join(map(html, part.parts))
+        return Markup("<details><summary>{}</summary>{}</details>").format(part.text, inside)
+    matrix = isinstance(part, Matrix)
+    table = part.table if isinstance(part, Matrix) else part
+    shown, numeric = (_two_places(table) if matrix else readable(table)), numeric_columns(table)
+    numbers = [number or _mostly_numbers(shown.iloc[:, k]) for k, number in enumerate(numeric)]
+    columns = [_aligned(shown.iloc[:, k]) if number else list(shown.iloc[:, k]) for k, number in enumerate(numbers)]
+    matrix = isinstance(part, Matrix)
+    styles = [
+        _backgrounds(table.iloc[:, k]) if matrix and number else [""] * len(table) for k, number in enumerate(numeric)
     ]
-    rows = list(shown.itertuples(index=False, name=None))
+    cells = [zip(*column, strict=True) for column in zip(columns, styles, strict=True)]
     return Markup(
         _TEMPLATES.get_template("table.html").render(
-            heads=[head_of(str(name)) for name in part.columns], kinds=kinds, rows=rows
+            heads=[head_of(str(name)) for name in table.columns], rows=list(zip(*cells, strict=True)),
+            caption=part.caption if isinstance(part, Matrix) else "",
+            style="matrix" if matrix else "texts" if any(len(c) > _LONG for column in columns for c in column) else "",
+            kinds=["number" if number else "text" for number in numbers],
         )
-    )
+    )  # fmt: skip
+
+
+def _two_places(table: pd.DataFrame) -> pd.DataFrame:
+    """Format correlations as text; adding zero removes the sign of zeros."""
+    return table.apply(lambda c: (c.round(2) + 0.0).map("{:.2f}".format) if c.dtype == float else c.astype(str))
+
+
+def _backgrounds(correlation: pd.Series) -> list[str]:
+    """Return the styles of correlations: red above zero, blue below, paler towards zero."""
+    colours = ("178, 24, 43", "33, 102, 172")
+    return [
+        f"background: rgba({colours[v < 0]}, {abs(v):.2f}){'; color: #fff' if abs(v) > _DARK else ''}"
+        if math.isfinite(v) else "" for v in correlation
+    ]  # fmt: skip
+
+
+def _aligned(column: pd.Series) -> list[str]:
+    """Pad right-aligned numbers with figure spaces, so that their decimal points are below each other."""
+    places = [len(cell.partition(".")[2]) if _DECIMAL.fullmatch(cell) else None for cell in column]
+    most = max((p for p in places if p is not None), default=0)
+    if not most:
+        return list(column)
+    return [
+        cell if p is None else cell + ("" if p else "\u2008") + "\u2007" * (most - p)
+        for cell, p in zip(column, places, strict=True)
+    ]
 
 
 def _mostly_numbers(column: pd.Series) -> bool:
     cells = [str(cell) for cell in column if cell]
-    return sum(bool(_NUMBER.match(cell)) and len(cell) < 40 for cell in cells) > len(cells) / 2
+    return sum(bool(_NUMBER.match(cell)) and len(cell) < _LONG for cell in cells) > len(cells) / 2
 
 
 def _svg(plot: Plot) -> Markup:
     """Return a figure as inline SVG that scales with the width of the page."""
     from matplotlib import rc_context
+    from matplotlib.figure import Figure
 
     figure = plot.figure
     if isinstance(figure, Path):
         content = base64.b64encode(figure.read_bytes()).decode()
         return Markup('<img alt="{}" src="data:image/png;base64,{}">').format(plot.alt, content)
-    if callable(figure):
-        draw, figure = figure, new_figure(4.8, plot.height)
-        draw(figure.subplots())
     drawing = io.StringIO()
     with rc_context(_SVG):
+        if callable(figure):
+            draw, figure = figure, Figure(figsize=(_WIDTH, plot.height))
+            draw(figure.subplots())
+            _arrange(figure)
         figure.savefig(drawing, format="svg", metadata=_NO_METADATA)
     svg = drawing.getvalue()
     return Markup('<figure role="img" aria-label="{}">{}</figure>').format(plot.alt, Markup(svg[svg.index("<svg") :]))
+
+
+def _arrange(figure: Figure) -> None:
+    """Set the margins of a panel: fixed, unless names of any length are along an axis.
+
+    Constrained layout takes as long as drawing.
+    """
+    from matplotlib.ticker import AutoLocator, FixedLocator
+
+    first, *others = figure.axes
+    for axis in (first.xaxis, first.yaxis):
+        locator = axis.get_major_locator()
+        if isinstance(locator, FixedLocator):
+            figure.set_layout_engine("constrained")
+            return
+        if isinstance(locator, AutoLocator):
+            locator.set_params(nbins=_TICKS)
+    (width, height), (left, right, bottom, top) = figure.get_size_inches(), _MARGINS
+    right = _RIGHT if others else right
+    figure.subplots_adjust(left / width, bottom / height, 1 - right / width, 1 - top / height)
 
 
 def anchor(heading: str) -> str:
@@ -181,7 +271,8 @@ def provenance(record: CommandRecord) -> list[Part]:
         "command": record.command,
         "versions": ", ".join(f"{name} {number}" for name, number in versions().items()),
     }
-    return [Heading("Provenance"), about, *([hash_table(record.inputs)] if record.inputs else [])]
+    hashes = [Folded("SHA-256 of the input files", [hash_table(record.inputs)])] if record.inputs else []
+    return [Heading("Provenance"), about, *hashes]
 
 
 def hash_table(files: Iterable[InputFile]) -> pd.DataFrame:

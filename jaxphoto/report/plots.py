@@ -15,9 +15,9 @@ from jaxtyping import Float
 
 from jaxphoto.block_edits import one_camera
 from jaxphoto.camera import Sensor, parameter_names
-from jaxphoto.errors import InputError, camera_words, printable
+from jaxphoto.errors import InputError, printable
 from jaxphoto.observations import AXES
-from jaxphoto.report.findings import symbol
+from jaxphoto.report.formatting import symbol
 from jaxphoto.report.tables import Tables
 from jaxphoto.stability import NORMAL_95, DistortionCurve, distortion_curve
 from jaxphoto.statistics.block_geometry import coverage, image_links
@@ -73,7 +73,7 @@ def prepare_pictures() -> None:
 
 def title(axes: Axes, text: str) -> None:
     """Set the title of a panel."""
-    axes.set_title(text, loc="left", fontsize=9)
+    axes.set_title(text, loc="left", fontsize=8.5)
 
 
 def log_ticks(axes: Axes) -> None:
@@ -119,8 +119,8 @@ def draw_matrix(axes: Axes, values: np.ndarray, rows: Sequence[str], columns: Se
 
 def draw_arrows(axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: float, text: str) -> None:
     """Draw arrows `v` at `at` (2 x n). The key is an arrow of size `key`, drawn length `length` and label `text`."""
-    arrows = axes.quiver(*at, *v, angles="xy", scale_units="xy", scale=key / length, width=0.003, color="tab:blue")
-    axes.quiverkey(arrows, 0.93, 1.04, key, text, labelpos="W")
+    arrows = axes.quiver(*at, *v, angles="xy", scale_units="xy", scale=key / length, width=0.004, color="tab:blue")
+    axes.quiverkey(arrows, 0.94, 1.05, key, text, labelpos="W", labelsep=0.05, fontproperties={"size": 7.5})
     axes.update_datalim((at + v * length / key).T)
     axes.autoscale_view()
 
@@ -134,7 +134,7 @@ def round_key(v: np.ndarray) -> float:
 # Residuals -------------------------------------------------------------------------------------------------------
 
 # Maximum number of arrows; number of the largest arrows that are always drawn.
-_ARROWS, _LARGEST = 4000, 100
+_ARROWS, _LARGEST = 300, 50
 # Number of cells along the longer side of the format; minimum number of residuals per cell mean.
 _CELLS, _FEW = 12, 5
 # Number of rings with equal numbers of image points; minimum number of residuals per ring.
@@ -154,11 +154,11 @@ def plot_residuals(tables: Tables, camera: str | None = None, ax: Axes | None = 
     """Draw the image residuals of all images over the format of a camera."""
     ax, camera = axes_or_new(ax), one_camera(tables.adjusted.block, camera)
     xy, v = residuals_of(tables, camera)
-    name = f"image residuals of {label(camera_words(camera))}"
+    name = _of_camera("residuals", tables, camera)
     if (n := v.shape[1]) > _ARROWS:
         one_in = -(-n // _ARROWS)
         shown = np.union1d(np.arange(0, n, one_in), np.argsort(np.hypot(*v))[-_LARGEST:])
-        xy, v, name = xy[:, shown], v[:, shown], f"{name}: 1 in {one_in}, and the largest {_LARGEST}"
+        xy, v, name = xy[:, shown], v[:, shown], f"{name}, 1 in {one_in}"
     return _over_format(ax, tables, camera, xy, v, name)
 
 
@@ -170,8 +170,13 @@ def plot_mean_residuals(tables: Tables, camera: str | None = None, ax: Axes | No
     n = np.bincount(cell, minlength=centres.shape[1])
     mean = np.stack([np.bincount(cell, one, centres.shape[1]) for one in v]) / np.maximum(n, 1)
     shown = n >= max(1, min(_FEW, n.max()))
-    name = f"mean residuals by cell, {label(camera_words(camera))}"
+    name = _of_camera("mean residuals", tables, camera)
     return _over_format(ax, tables, camera, centres[:, shown], mean[:, shown], name)
+
+
+def _of_camera(name: str, tables: Tables, camera: str) -> str:
+    """Add the camera if there are several."""
+    return f"{name}, {label(camera)}" if len(tables.adjusted.unknowns.interior) > 1 else name
 
 
 def _over_format(ax: Axes, tables: Tables, camera: str, xy: np.ndarray, v: np.ndarray, name: str) -> Axes:
@@ -180,20 +185,6 @@ def _over_format(ax: Axes, tables: Tables, camera: str, xy: np.ndarray, v: np.nd
     draw_arrows(ax, xy, v, key, 0.06 * sensor.width_mm, f"{1000 * key:g} µm{in_px}")
     draw_format(ax, sensor)
     title(ax, name)
-    return ax
-
-
-def plot_density(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the number of image points in each cell of the format."""
-    ax, camera = axes_or_new(ax), one_camera(tables.adjusted.block, camera)
-    sensor = tables.adjusted.block.sensors[camera]
-    cell, centres = _cells(sensor, residuals_of(tables, camera)[0])
-    number = np.bincount(cell, minlength=centres.shape[1]).reshape(-1, len(np.unique(centres[0])))
-    w, h = sensor.width_mm / 2, sensor.height_mm / 2
-    shown = ax.imshow(number, origin="lower", extent=(-w, w, -h, h), cmap="cividis", vmin=0)
-    ax.figure.colorbar(shown, ax=ax, shrink=0.8)
-    ax.set(xlabel="x [mm]", ylabel="y [mm]")
-    title(ax, "image points by cell of the format, all images")
     return ax
 
 
@@ -213,7 +204,7 @@ def plot_residuals_by_radius(tables: Tables, camera: str | None = None, ax: Axes
     """Draw mean radial and tangential residuals by distance from the principal point, with bars of two sigmas."""
     ax, camera = axes_or_new(ax), one_camera(tables.adjusted.block, camera)
     xy, v = residuals_of(tables, camera)
-    title(ax, "residuals by distance from the principal point" if xy.size else "no residuals")
+    title(ax, "mean residuals by distance" if xy.size else "no residuals")
     if not xy.size:
         return ax
     offset = xy - np.asarray(tables.adjusted.unknowns.interior[camera].principal_point)[:, None]
@@ -372,7 +363,7 @@ def draw_sigma_map(axes: Axes, sensor: Sensor, one: SigmaMap) -> None:
     """Draw the standard deviation in the worst direction (px)."""
     worst = np.asarray(one.worst)
     known = np.isfinite(worst)
-    name = f"sigma {distance_words(one.distance_m)}, worst direction [px]"
+    name = f"sigma {distance_words(one.distance_m).removeprefix('of a point ')} [px]"
     draw_format_map(axes, sensor, np.asarray(one.points)[known], name, worst[known] / sensor.pixel_mm)
 
 
@@ -392,44 +383,33 @@ def distortion_of(tables: Tables, camera: str | None = None) -> DistortionCurve:
 
 
 def plot_distortion(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw radial distortion by distance from the principal point with its 95 % band, and the non-radial distortion."""
+    """Draw radial and non-radial distortion by distance from the principal point, and the 95 % half-width of radial."""
     ax = axes_or_new(ax)
     draw_distortion(ax, distortion_of(tables, camera))
     return ax
 
 
 def draw_distortion(axes: Axes, curve: DistortionCurve, factor: float = 1.0) -> None:
-    """Draw radial distortion (um) with its 95 % band times `factor`, and the non-radial distortion."""
-    um = 1e3
+    """Draw radial and other distortion (um); its 95 % half-width times `factor`, thinner than a line, on the right."""
+    lines = [
+        *axes.plot(curve.r, 1e3 * curve.radial, "-", color="#08519c", label="radial"),
+        *axes.plot(curve.r, 1e3 * curve.other, "--", color="#d95f02", label="decentring, affinity"),
+    ]
     if curve.sigma is not None:
-        half = um * NORMAL_95 * factor * curve.sigma
-        band = um * curve.radial - half, um * curve.radial + half
-        axes.fill_between(curve.r, *band, color="#9ecae1", label="95 % band", lw=0)
-    axes.plot(curve.r, um * curve.radial, "-", color="#08519c", label="radial")
-    axes.plot(curve.r, um * curve.other, "--", color="#d95f02", label="decentring, affinity (RMS)")
+        half_width = axes.twinx()
+        half = 1e3 * NORMAL_95 * factor * curve.sigma
+        lines += half_width.plot(curve.r, half, ":", color="tab:green", label="95 % of radial (right)")
+        half_width.set(ylabel="95 % within +- [µm]", ylim=(0, None))
     axes.axhline(0, color="0.6", lw=0.6)
     axes.set(xlabel="distance from the principal point [mm]", ylabel="measured - ideal [µm]")
     title(axes, "distortion")
-    axes.legend(fontsize=7)
-
-
-def plot_distortion_band(tables: Tables, camera: str | None = None, ax: Axes | None = None) -> Axes:
-    """Draw the half width of the 95 % band of the radial distortion.
-
-    In a plot of the curve the band is often thinner than the line.
-    """
-    ax, curve = axes_or_new(ax), distortion_of(tables, camera)
-    if curve.sigma is not None:
-        ax.plot(curve.r, 1e3 * NORMAL_95 * curve.sigma, "-", color="#08519c")
-    ax.set(xlabel="distance from the principal point [mm]", ylabel="95 % within +- [µm]", ylim=(0, None))
-    title(ax, "uncertainty of the radial distortion")
-    return ax
+    axes.legend(handles=lines, fontsize=7)
 
 
 # Block -----------------------------------------------------------------------------------------------------------
 
 # Length of the major axis of the median error ellipse, as a fraction of the extent of the block.
-_ELLIPSE = 0.03
+_ELLIPSE = 0.045
 
 
 def ellipse_axes(
@@ -466,7 +446,7 @@ def plot_error_ellipses(tables: Tables, ax: Axes | None = None) -> Axes:
         ax.update_datalim(np.concatenate([at[known, :2] - reach, at[known, :2] + reach]))
         ax.autoscale_view()
         ax.figure.colorbar(ellipses, ax=ax, shrink=0.8, label=f"sigma of Z [{unit}]")
-        name += f", {factor:,.0f} times; largest {a.max():.2g} {unit}"
+        name = f"error ellipses x {factor:,.0f}, largest {a.max():.2g} {unit}"
     ax.set(xlabel=f"X [{unit}]", ylabel=f"Y [{unit}]")
     title(ax, name)
     ax.set_aspect("equal", adjustable="datalim")
@@ -486,13 +466,13 @@ def plot_overlap(tables: Tables, ax: Axes | None = None) -> Axes:
     """Draw the number of images that cover each cell of the ground; coordinates in metres."""
     ax, cover = axes_or_new(ax), tables.coverage or coverage(tables.adjusted)
     counts = np.ma.masked_less(cover.seen_by, 1)
-    x, y = (np.append(v - cover.step_m / 2, v[-1] + cover.step_m / 2) for v in (cover.x, cover.y))
-    shown = ax.pcolormesh(x, y, counts, cmap="viridis", rasterized=True)
+    (x0, x1), (y0, y1) = ((v[0] - cover.step_m / 2, v[-1] + cover.step_m / 2) for v in (cover.x, cover.y))
+    shown = ax.imshow(counts, cmap="viridis", origin="lower", extent=(x0, x1, y0, y1))
     ax.figure.colorbar(shown, ax=ax, label="images", shrink=0.8)
     station = np.asarray(tables.adjusted.unknowns.exterior.position)
     ax.plot(station[:, 0], station[:, 1], "w+", ms=5, mew=0.8)
     ax.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
-    title(ax, "overlap: images per cell of the ground")
+    title(ax, "overlap")
     return ax
 
 

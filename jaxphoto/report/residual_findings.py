@@ -16,8 +16,8 @@ from jaxphoto.errors import camera_words, few
 from jaxphoto.observations import PRIORS, Correlated
 from jaxphoto.procedures.adjust import ABSURD
 from jaxphoto.procedures.snooping import SEVERAL, InflatedComponent, Snooped, mostly_rejected, rejected_images
-from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words, symbol
-from jaxphoto.report.formatting import in_file_unit
+from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words
+from jaxphoto.report.formatting import in_file_unit, symbol
 from jaxphoto.report.tables import Tables
 from jaxphoto.unknowns import Weighted
 

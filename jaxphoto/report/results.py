@@ -28,13 +28,16 @@ from jaxphoto.report.formatting import (
     of_sigma,
     plus_minus,
     readable,
+    symbol,
     with_sigma,
     without_empty,
     write_table,
 )
 from jaxphoto.report.page import (
     CommandRecord,
+    Folded,
     Heading,
+    Matrix,
     Paragraph,
     Part,
     Plot,
@@ -63,10 +66,12 @@ _TABLES = (
 # Additional tables if the files of the block are in an EPSG system.
 _MAP_TABLES = ("exterior_map", "object_points_map")
 # Maximum numbers: plotted cameras, rows of the largest residuals, rows of the iteration history, findings at the top.
-_PLOTTED, _LARGEST, _STEPS, _TOP = 6, 20, 40, 3
+_PLOTTED, _LARGEST, _STEPS, _TOP = 6, 12, 40, 3
+# Height of a plan (inches).
+_PLAN = 3.0
 _RELIABILITY = {
-    "c_moves": "c moves [sigma]", "xp_moves": "xp moves [sigma]", "yp_moves": "yp moves [sigma]",
-    "most_moves": "any moves [sigma]", "redundancy_number": "r", "detectable": "MDB",
+    "c_moves": "effect on c [sigma]", "xp_moves": "on x_p [sigma]", "yp_moves": "on y_p [sigma]",
+    "most_moves": "largest effect [sigma]", "redundancy_number": "r", "detectable": "MDB",
 }  # fmt: skip
 _EFFECTS = {"pattern": "systematic effect", "freedom": "degrees of freedom", "share": "fraction", "amount": "estimate"}
 # Classes in the table of object points: minimum number of rays of each class.
@@ -98,7 +103,7 @@ def write_results(
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
             # Return memory to the system: a table of millions of rows leaves hundreds of MB.
             return_freed_memory()
-        (work / "report.html").write_text(report_page(tables, verdict, record), encoding="utf-8")
+        (work / "report.html").write_text(report_page(tables, verdict, record, seconds), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
         write_summary(summary | dict(entries), work)
 
@@ -201,14 +206,23 @@ def _global_test(tables: Tables) -> dict[str, Any]:
 # Report ----------------------------------------------------------------------------------------------------------
 
 
-def report_page(tables: Tables, verdict: Verdict, record: CommandRecord | None = None) -> str:
-    """Return the report as HTML: verdict, summary, at most three findings, then all sections."""
+def report_page(
+    tables: Tables,
+    verdict: Verdict,
+    record: CommandRecord | None = None,
+    seconds: Mapping[str, float] = MappingProxyType({}),
+) -> str:
+    """Return the report as HTML: verdict, at most three findings, summary with times (`seconds`), then all sections."""
     block = tables.adjusted.block
-    parts: list[Part] = [*verdict_parts(verdict)[:_TOP], summary_table(tables)]
+    summary = summary_table(tables)
+    if seconds:
+        each = ", ".join(f"{name} {value:.2g} s" for name, value in seconds.items())
+        summary["computing time"] = f"{sum(seconds.values()):.2g} s ({each})"
+    parts: list[Part] = [*verdict_parts(verdict)[:_TOP], summary]
     if len(verdict.findings) > _TOP:
         table = verdict.table.iloc[_TOP:]
         fact = [text.removesuffix(f". {hint}") for text, hint in zip(table["text"], table["hint"], strict=True)]
-        columns = ["severity", "code", "subject", "value", "limit", "finding", "hint"]
+        columns = ["severity", "code", "value", "limit", "finding", "hint"]
         parts += [Heading("Further findings"), without_empty(table.assign(finding=fact)[columns])]
     parts += adjustment_sections(tables)
     if record:
@@ -233,13 +247,11 @@ def summary_table(tables: Tables) -> dict[str, str]:
             f"{sensor.width_px} x {sensor.height_px} px of {1e3 * sensor.pixel_mm:.4g} µm, c = {float(interior.c):.5g} "
             f"mm, {interior.projection.name}, {interior.distortion.name}"
         )
-    pixel = np.array([block.sensors[c].pixel_mm for c in block.image_camera])[a.structure.image]
-    sigma, v = np.asarray(a.values.sigma_xy), np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy)
-    test, sigma0 = _global_test(tables), float(a.sigma0)
-    rows["sigma naught"] = f"{sigma0:.6g} = {sigma0 * np.median(sigma / pixel) if sigma.size else np.nan:.2g} px" + (
-        f", expected {test['expected_sigma0']:.3g}, {p_words(test['p_value'], 2)}" if test else ""
-    )
-    if v.size:
+    test, sigma0, sigma, pixel = _global_test(tables), float(a.sigma0), np.asarray(a.values.sigma_xy), _pixels(a)
+    rows["sigma naught"] = f"{sigma0:.6g}" + (f" = {sigma0 * np.median(sigma / pixel):.2g} px" if sigma.size else "")
+    rows["sigma naught"] += f", expected {test['expected_sigma0']:.3g}, {p_words(test['p_value'], 2)}" if test else ""
+    if sigma.size:
+        v = np.asarray(a.residuals.image) * sigma
         mm, px = (float(np.sqrt(np.mean(values**2))) for values in (v, v / pixel))
         largest = float(np.hypot(*(v / pixel)).max())
         rows["image residuals"] = f"RMS {px:.2g} px = {1e3 * mm:.3g} µm per axis, largest {largest:.2g} px"
@@ -251,6 +263,7 @@ def summary_table(tables: Tables) -> dict[str, str]:
     spread = check_spread(tables.check_points)
     rmse = ", ".join(f"{axis} {of_sigma(r)}" for axis, r, n in spread[["axis", "rmse", "n"]].to_numpy() if n)
     rows["check points"] = f"{len(tables.check_points)}, RMSE {rmse} m" if rmse else "none"
+    rows["standard deviations"] = "a posteriori (a priori times sigma naught)"
     rows["iteration"] = as_sentence(f"{a.outcome.value} ({counted(int(a.steps), 'iteration')})")
     return rows
 
@@ -291,29 +304,25 @@ def _sections(tables: Tables, start: InteriorOrientation | None, factor: float) 
     mapped = [camera for camera in tables.sigma_maps if camera in cameras]
     yield from _interior(tables, cameras, start, factor)
     if mapped:
-        yield Heading("Distortion")
-        yield Paragraph("Measured minus ideal image coordinates along the radius, for the adjusted c.")
-        for camera in mapped:
-            curve, words = plots.distortion_of(tables, camera), camera_words(camera)
-            draw, band = partial(plots.draw_distortion, curve=curve, factor=factor), plots.plot_distortion_band
-            yield [
-                Plot(draw, f"distortion of {words} by distance"),
-                Plot(partial(band, tables, camera), f"95 % band for {words}"),
-            ]
-        yield Heading("Projection uncertainty over the image format")
+        yield Heading("Distortion and projection uncertainty over the image format")
         yield Paragraph(
-            "Standard deviation of a projected point by interior and exterior orientation, in the worst direction "
-            "(sigma_map.csv). At infinity the error in c propagates fully; at the object distance it is partly "
-            "compensated by the camera position."
+            "Distortion: measured minus ideal image coordinates along the radius, for the adjusted c. Projection "
+            "uncertainty: standard deviation of a projected point by interior and exterior orientation in the worst "
+            "direction (sigma_map.csv). At infinity the error in c propagates fully; at the object distance it is "
+            "partly compensated by the camera position."
         )
         for camera in mapped:
-            maps, sensor = [], a.block.sensors[camera]
+            curve, words = plots.distortion_of(tables, camera), camera_words(camera)
+            row = [
+                Plot(partial(plots.draw_distortion, curve=curve, factor=factor), f"distortion of {words} by distance")
+            ]
+            sensor = a.block.sensors[camera]
             for one in tables.sigma_maps[camera]:
                 px = one.worst[np.isfinite(one.worst)] / sensor.pixel_mm
                 spread = f"median {np.median(px):.2g} px, worst {px.max():.2g} px" if len(px) else "unknown"
                 words = f"{camera_words(camera)}: sigma {plots.distance_words(one.distance_m)}, {spread}"
-                maps.append(Plot(partial(plots.draw_sigma_map, sensor=sensor, one=one), words))
-            yield maps
+                row.append(Plot(partial(plots.draw_sigma_map, sensor=sensor, one=one), words))
+            yield row
     if tables.truth:
         yield Heading("Recovery of the true values")
         yield Paragraph(
@@ -325,32 +334,20 @@ def _sections(tables: Tables, start: InteriorOrientation | None, factor: float) 
     if len(tables.georeferencing):
         yield from (Heading("Mounts and strips"), tables.georeferencing)
     yield Heading("Block")
-    layout = [Plot(partial(plot_block, a), block_words(a.block), 4.2)]
+    layout = [Plot(partial(plot_block, a), block_words(a.block), _PLAN)]
     if tables.coverage is not None:
-        layout.append(
-            Plot(partial(plots.plot_overlap, tables), "overlap: number of images per cell of the ground", 4.2)
-        )
-    yield layout
+        layout.append(Plot(partial(plots.plot_overlap, tables), "overlap: images per cell of the ground", _PLAN))
+    yield [*layout, Plot(partial(plots.plot_error_ellipses, tables), "error ellipses of projection centres", _PLAN)]
     yield from _residuals(tables, cameras)
     yield from points_section(tables)
     yield from _check_points(tables)
     yield Heading("Exterior orientation")
-    yield [Plot(partial(plots.plot_error_ellipses, tables), "error ellipses of projection centres", 4)]
-    yield tables.exterior
-    if len(summary := tables.correlation_summary):
-        yield Heading("Correlation of exterior and interior orientation over the images")
-        yield Paragraph("The largest absolute correlation over the images; means are in correlation_summary.csv.")
-        yield side_by_side(summary, ["camera", "exterior"], "interior", "max_abs_rho")
-    ground = tables.correlation_ground
-    if len(ground := ground[ground["sigma_m"] > 0]):
-        yield Heading("Correlation of the interior orientation and the ground as a whole")
-        ground = ground.assign(ground=ground["ground"].str.replace("_", " "))
-        yield side_by_side(ground, ["camera", "ground", "sigma_m"], "parameter", "rho")
+    yield Folded(f"{counted(len(tables.exterior), 'image')} (exterior.csv)", [tables.exterior])
     if len(tables.convergence):
         yield Heading("Convergence")
         yield Paragraph(convergence_words(a))
-        yield [Plot(partial(plots.plot_convergence, tables), "sigma naught before each step and at the end", 3)]
-        yield tables.convergence.tail(_STEPS).rename(columns={"length": "step in sigmas"})
+        steps = tables.convergence.tail(_STEPS).rename(columns={"length": "step in sigmas"})
+        yield Folded("sigma naught by iteration (convergence.csv)", [steps])
 
 
 def plotted_cameras(tables: Tables) -> list[str]:
@@ -362,22 +359,24 @@ def plotted_cameras(tables: Tables) -> list[str]:
 
 
 def interior_table(tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0) -> pd.DataFrame:
-    """Tabulate interior parameters: initial values, estimates, sigmas (times `factor`), in pixels, significance."""
+    """Tabulate interior parameters: initial value, estimate, sigmas before and after, significance.
+
+    `factor`: factor of the standard deviations for correlated residuals (`with_correlated_sigma`).
+    """
     table = with_correlated_sigma(shown_interior(tables), tables.adjusted, factor)
     rows = []
     for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
-        name, pixel, estimated = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma"] > 0
-        correlated, in_mm = p["sigma_correlated"], estimated and name.endswith("_mm")
+        name, pixel, sigma = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma_correlated"]
         first = start or tables.adjusted.block.start.unknowns.interior[p["camera"]]
         priors = tables.adjusted.priors.interior[p["camera"]]
         prior = get_parameter(priors, name) if name in parameter_names(priors) else None
+        in_px = plus_minus(p["value"] / pixel, sigma / pixel) if sigma > 0 and name.endswith("_mm") else ""
         rows.append({
             "camera": p["camera"], "parameter": name,
             "initial": f"{float(get_parameter(first, name)):.6g}" if name in parameter_names(first) else "",
             "prior sigma": of_sigma(float(prior.sigma)) if isinstance(prior, Weighted) else "",
-            "value": with_sigma(p["value"], p["sigma"]), "sigma": of_sigma(p["sigma"]) if estimated else "fixed",
-            "sigma (correlated residuals)": of_sigma(correlated) if estimated and factor > 1 else "",
-            "unit": p["unit"], "in pixels": plus_minus(p["value"] / pixel, correlated / pixel) if in_mm else "",
+            "value": with_sigma(p["value"], sigma), "sigma": of_sigma(sigma) if sigma > 0 else "fixed",
+            "unit": p["unit"], "in pixels": in_px,
             "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
         })  # fmt: skip
     shown = without_empty(pd.DataFrame(rows))
@@ -389,9 +388,9 @@ def _interior(
 ) -> Iterator[Part]:
     yield Heading("Interior orientation")
     yield interior_table(tables, start, factor)
+    correlated = f", for spatially correlated residuals (factor {factor:.2g})" if factor > 1 else ""
     yield Paragraph(
-        "Lengths in mm, x to the right and y up from the centre of the format. Standard deviations are a posteriori "
-        f"(times sigma naught); correlations refer to the rotations {tables.rotations.replace('_', ', ')}."
+        f"x to the right and y up from the centre of the format. Standard deviations are a posteriori{correlated}."
     )
     yield from assumed_pixels(tables.adjusted.block.sensors)
     for camera in cameras:
@@ -406,40 +405,59 @@ def _interior(
     if (n := len(tables.adjusted.unknowns.interior)) > len(cameras):
         some = ", ".join(cameras)
         yield Paragraph(f"Plots show {len(cameras)} of {n} cameras, those with the most image points: {some}.")
+    yield from _correlations(tables, cameras)
+
+
+def _correlations(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
+    shown = []
     for camera, c in tables.correlations.items():
         if camera in cameras and c.parameters:
-            pair = (plots.plot_interior_correlation, plots.plot_exterior_correlation)[: 1 + bool(c.images)]
-            yield [Plot(partial(plot, tables, camera), f"correlations of {camera_words(camera)}", 3.8) for plot in pair]
+            names = [symbol(name) for name in c.parameters]
+            of_camera = f" of {camera_words(camera)}" if len(tables.correlations) > 1 else ""
+            table = pd.DataFrame(c.interior, columns=names).assign(parameter=names)[["parameter", *names]]
+            shown.append(Matrix(table, f"Interior orientation{of_camera}"))
+    if len(summary := tables.correlation_summary):
+        wide = side_by_side(summary, ["camera", "exterior"], "interior", "max_abs_rho")
+        shown.append(Matrix(wide, "Exterior and interior orientation: largest |correlation| of all images"))
+    ground = tables.correlation_ground
+    if len(ground := ground[ground["sigma_m"] > 0]):
+        named = ground.assign(ground=ground["ground"].str.replace("_", " "), sigma_m=ground["sigma_m"].map(of_sigma))
+        wide = side_by_side(named, ["camera", "ground", "sigma_m"], "parameter", "rho")
+        shown.append(Matrix(wide, "Interior orientation and the ground as a whole"))
+    if shown:
+        yield Heading("Correlations")
+        yield Paragraph(f"Rotations: {tables.rotations.replace('_', ', ')}. Means: correlation_summary.csv.")
+        yield shown
 
 
 def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
     yield Heading("Residuals")
     yield tables.residual_spread
     for camera in cameras:
-        panels = {
-            "image residuals": plots.plot_residuals, "mean residuals by cell": plots.plot_mean_residuals,
-            "image points by cell": plots.plot_density,
-        }  # fmt: skip
+        panels = {"image residuals": plots.plot_residuals, "mean residuals by cell": plots.plot_mean_residuals}
         if camera in tables.sigma_maps:
             panels["residuals by distance from the principal point"] = plots.plot_residuals_by_radius
         words = camera_words(camera)
-        yield [Plot(partial(plot, tables, camera), f"{name}, {words}", 3.8) for name, plot in panels.items()]
-    if len(tables.adjusted.block.stations.who):
-        yield [Plot(partial(plots.plot_station_residuals, tables), "residuals of stations in order of time")]
+        yield [Plot(partial(plot, tables, camera), f"{name}, {words}") for name, plot in panels.items()]
+    row = []
     if len(tables.checked_w):
         yield Paragraph(
             "Normalised residuals w: residual over its standard deviation. Without blunders and with true weights "
             "they are standard normal."
         )
-        yield [Plot(partial(plot, tables), f"{name} of normalised residuals")
-               for name, plot in (("histogram", plots.plot_w), ("Q-Q plot", plots.plot_w_quantiles))]  # fmt: skip
+        row += [Plot(partial(plots.plot_w, tables), "histogram of normalised residuals"),
+                Plot(partial(plots.plot_w_quantiles, tables), "Q-Q plot of normalised residuals")]  # fmt: skip
+    if len(tables.adjusted.block.stations.who):
+        row.append(Plot(partial(plots.plot_station_residuals, tables), "residuals of stations in order of time"))
+    yield row
     if len(tables.trends):
         yield Paragraph("Systematic residuals, by image format, time and strip:")
         yield without_empty(readable(tables.trends)).rename(columns=_EFFECTS)
     largest = tables.residuals.loc[tables.checked_w.abs().nlargest(_LARGEST).index]
     yield Paragraph(
-        "Largest normalised residuals. r is the redundancy number, MDB the minimal detectable bias (power 80 %); the "
-        "last columns are its external reliability: by how many sigmas a bias of one MDB moves an estimate."
+        "Largest normalised residuals. r is the redundancy number. Internal reliability: MDB, the minimal detectable "
+        "bias (power 80 %), in the unit of the row. External reliability: the effect of an undetected bias of one "
+        "MDB on c, x_p, y_p and the most affected estimate, in its standard deviations."
     )
     yield readable(largest).rename(columns=_RELIABILITY)
 
@@ -466,27 +484,46 @@ def points_section(tables: Tables) -> Iterator[Part]:
         f"{table['n_images'].mean():.2f} rays per point on average. The angle is the largest between two rays; {small} "
         f"points have less than {_SMALL_DEG:g} degrees."
     )
-    yield [Plot(partial(plots.plot_intersection_angles, tables), "histogram of intersection angles")]
 
 
 def _check_points(tables: Tables) -> Iterator[Part]:
     control = tables.residuals[tables.residuals["group"] == "control_points"]
     if len(control):
         yield Heading("Control points")
-        yield Paragraph("Surveyed minus adjusted (m), and the standard deviations of the adjusted coordinates.")
+        yield Paragraph(
+            "Surveyed minus adjusted coordinates, the standard deviations of the adjusted coordinates, and the RMS of "
+            "the image residuals per axis."
+        )
         wide = control.astype({"axis": str, "point": str}).pivot_table("residual", "point", "axis", sort=False)
         wide = wide.rename(columns="d{}_m".format).assign(total_m=np.sqrt((wide**2).sum(axis=1)))
         sigma = tables.object_points.set_index("point")[[f"sigma_{axis}_m" for axis in AXES]]
-        yield wide.join(sigma.set_axis(sigma.index.astype(str))).reset_index()
+        yield _with_image_residuals(wide.join(sigma.set_axis(sigma.index.astype(str))).reset_index(), tables)
     if len(tables.check_points):
         yield Heading("Check points: surveyed minus computed")
         yield check_spread(tables.check_points)
         yield [
             Plot(partial(plots.plot_check_points, tables, upright=up),
-                 f"discrepancies at check points in {'height' if up else 'plan'}", 3.8)
+                 f"discrepancies at check points in {'height' if up else 'plan'}", _PLAN)
             for up in (False, True)
         ]  # fmt: skip
-        yield tables.check_points
+        yield _with_image_residuals(tables.check_points, tables)
+
+
+def _with_image_residuals(points: pd.DataFrame, tables: Tables) -> pd.DataFrame:
+    """Add the number of images and the RMS of the image residuals per axis (px) of each point."""
+    a = tables.adjusted
+    px = np.asarray(a.residuals.image) * np.asarray(a.values.sigma_xy) / _pixels(a)
+    n = np.bincount(a.structure.point, minlength=len(a.block.points))
+    square = np.bincount(a.structure.point, (px**2).sum(axis=0), len(n))
+    number = points["point"].astype(str).map({str(point): k for k, point in enumerate(a.block.points)})
+    rms = np.sqrt(square / np.where(n > 0, 2 * n, np.nan))
+    return points.assign(images=n[number], rms_px=rms[number])
+
+
+def _pixels(adjusted: Adjustment) -> np.ndarray:
+    """Return the pixel size (mm) of each image point."""
+    sensors = adjusted.block.sensors
+    return np.array([sensors[camera].pixel_mm for camera in adjusted.block.image_camera])[adjusted.structure.image]
 
 
 def convergence_words(adjusted: Adjustment) -> str:

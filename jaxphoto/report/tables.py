@@ -19,8 +19,7 @@ from jaxphoto.camera import RATES, constant_names, get_parameter, parameter_name
 from jaxphoto.compiling import call_compiled
 from jaxphoto.observations import AXES, AbstractObservations
 from jaxphoto.parameters import numbers_of, unit_of
-from jaxphoto.report.findings import symbol
-from jaxphoto.report.formatting import in_file_unit, label_unit
+from jaxphoto.report.formatting import in_file_unit, label_unit, symbol
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.statistics.block_geometry import Coverage, coverage, intersection_angles
 from jaxphoto.statistics.correlation import FORMS
@@ -499,10 +498,9 @@ def check_spread(check: pd.DataFrame) -> pd.DataFrame:
 
 
 def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) -> pd.DataFrame:
-    """Pivot a table of correlations as text; the column camera is dropped if there is only one."""
-    names = table[column].map(lambda name: symbol(name).replace("_", ""))
-    texts = table.assign(**{column: names, value: table[value].map("{:.3f}".format)})
-    wide = texts.pivot_table(value, rows, column, aggfunc="first", sort=False).fillna("").reset_index()
+    """Pivot a table of correlations; the column camera is dropped if there is only one."""
+    named = table.assign(**{column: table[column].map(symbol)})
+    wide = named.pivot_table(value, rows, column, aggfunc="first", sort=False).reset_index()
     return wide if len(wide["camera"].unique()) > 1 else wide.drop(columns="camera")
 
 

@@ -12,7 +12,8 @@ from jaxphoto.report.residual_findings import component_tables
 from jaxphoto.report.tables import Tables, check_spread, recovery_spread, shown_interior
 from jaxphoto.statistics import VarianceComponents
 
-_FINDINGS, _PARAMETERS = 12, 18
+# Maximum numbers of findings, of notes, and of parameters of mounts and strips.
+_FINDINGS, _NOTES, _PARAMETERS = 12, 3, 18
 _COLOURS = {"note": "green", "warning": "yellow", "error": "red"}
 
 
@@ -28,11 +29,13 @@ def print_lines(lines, console: Console) -> None:
 
 
 def print_verdict(verdict: Verdict, console: Console) -> None:
-    """Print a verdict with its first findings."""
+    """Print a verdict with its errors and warnings, or its first notes."""
     console.print(Text(verdict.headline, f"bold {_COLOURS[verdict.severity]}"))
-    for finding in verdict.findings[:_FINDINGS]:
+    serious = sum(finding.severity != "note" for finding in verdict.findings)
+    shown = verdict.findings[: min(max(serious, _NOTES), _FINDINGS)]
+    for finding in shown:
         console.print(Text(f"{MARKS[finding.severity]} ", _COLOURS[finding.severity]) + plain(finding.text))
-    if (more := len(verdict.findings) - _FINDINGS) > 0:
+    if more := len(verdict.findings) - len(shown):
         console.print(f"and {more} more in report.html")
 
 

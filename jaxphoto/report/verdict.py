@@ -16,8 +16,8 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
 from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.procedures.adjust import left_out_words
-from jaxphoto.report.findings import Finding, Severity, Verdict, p_words, symbol
-from jaxphoto.report.formatting import of_sigma, plus_minus
+from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
+from jaxphoto.report.formatting import of_sigma, plus_minus, symbol
 from jaxphoto.report.residual_findings import NOTHING_FITS, reliability_findings, residual_findings, stretch_findings
 from jaxphoto.report.tables import Tables
 from jaxphoto.statistics import (
@@ -72,7 +72,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         yield from _not_converged(adjusted)
         # Stop here: statistics are valid only at an optimum.
         return
-    prepare_hat_matrix(adjusted.equations, adjusted.seconds)
+    prepare_hat_matrix(adjusted)
     yield from (Finding("prior_information", "warning", doubt) for doubt in adjusted.block.prior_warnings)
     if adjusted.left_out:
         yield Finding("rejected", "warning", left_out_words(adjusted))

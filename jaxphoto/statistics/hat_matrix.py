@@ -148,14 +148,13 @@ def inner_products(a: Increments, b: Increments) -> Float[ArrayLike, "m n"]:
     return products
 
 
-def prepare_hat_matrix(equations: NormalEquations, seconds: dict[str, float]) -> None:
+def prepare_hat_matrix(adjusted: Adjustment) -> None:
     """Compile the programs of `HatMatrix` in the background."""
     if jax.process_count() > 1:
         # Argument types of arrays sharded over several processes cannot be predicted here.
         return
-    equations = equations.on_one_device.weighed
-    shapes = jax.tree.leaves(jax.eval_shape(lambda e: e.at.residuals(), equations))
-    n = sum(math.prod(v.shape) for v in shapes)
+    hat, seconds = HatMatrix.of(adjusted), adjusted.seconds
+    equations, n = hat.equations, len(hat.laid)
     prepare(_pull, (equations, np.broadcast_to(0.0, (_batch(n), n))), seconds)
     prepare_solving(equations, seconds)
     prepare(_push, (equations, blank(equations.scale, _batch(n))), seconds)

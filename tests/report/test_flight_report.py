@@ -23,7 +23,6 @@ from jaxphoto.report.flight import (
     positions_section,
     provenance_section,
 )
-from jaxphoto.report.plots import plot_density
 from jaxphoto.report.results import interior_table
 from tests.blocks import BROWN
 from tests.report.flights import OFFSETS_M, VERDICT, part_report, source
@@ -61,7 +60,7 @@ def test_the_documentation_lists_the_sections_of_the_page(page):
     document = (
         (Path(__file__).parents[2] / "docs" / "report.md").read_text(encoding="utf-8").split("## Report of a flight")[1]
     )
-    listed = re.findall(r"^\| ([^|]+) \|", document.split("\n\nEquivalent terms")[0], re.MULTILINE)[2:]
+    listed = re.findall(r"^\| ([^|]+) \|", document.split("\n\nContents of other reports")[0], re.MULTILINE)[2:]
     assert [t for t in told if t not in ("Part 2", "Files")] == [t for t in listed if t in told]
     # Sections of blocks with control, check points, more than one mount, or variance components.
     optional = {"Mounts and strips", "Control points", "Check points: surveyed minus computed", "Variance components"}
@@ -89,9 +88,9 @@ def test_initial_and_estimated_camera_are_shown():
     table = report.tables.interior.set_index("parameter")
     assert float(rows.loc["c_mm", "initial"]) == BROWN.c
     c, sigma = table.loc["c_mm", ["value", "sigma"]].astype(float)
-    assert float(rows.loc["c_mm", "value"]) == pytest.approx(c, abs=0.06 * sigma)
+    assert float(rows.loc["c_mm", "value"]) == pytest.approx(c, abs=0.09 * sigma)
     # Without priors, correlated residuals widen all of sigma.
-    assert float(rows.loc["c_mm", "sigma (correlated residuals)"]) == pytest.approx(1.5 * sigma, rel=0.05)
+    assert float(rows.loc["c_mm", "sigma"]) == pytest.approx(1.5 * sigma, rel=0.05)
 
 
 def test_offsets_by_axis():
@@ -123,17 +122,6 @@ def test_arrows_are_offsets_of_used_and_rejected_positions():
     np.testing.assert_allclose(np.stack([used.U, used.V], 1), OFFSETS_M[:3, :2] - mean)
     np.testing.assert_allclose(np.stack([left.U, left.V], 1), OFFSETS_M[3:, :2] - mean)
     assert used.scale == left.scale
-
-
-def test_density_counts_every_image_point():
-    report = part_report()
-    axes = plot_density(report.tables, "one", Figure().subplots())
-    number = axes.images[0].get_array()
-    a = report.part.adjusted
-    assert number.sum() == len(a.structure.image)
-    # The first row of cells is the lowest.
-    low = np.asarray(a.values.xy)[1] < -a.block.sensors["one"].height_mm * (0.5 - 1 / number.shape[0])
-    assert number[0].sum() == low.sum()
 
 
 def test_points_of_more_rays_are_surer():

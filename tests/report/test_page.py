@@ -89,7 +89,7 @@ def test_tables_are_escaped_long_ones_scroll_and_numbers_are_on_the_right():
     assert 'class="wide long"' in long and "long" not in short
     columns = {"name": ["<a>", "b", "c"], "n": ["-1.5 px", "", "3"], "why": ["two of them", "cut off", "blank"]}
     text = html(pd.DataFrame(columns))
-    assert "&lt;a&gt;" in text and text.count('"number"') == 4 and text.count('"text"') == 8
+    assert "&lt;a&gt;" in text and text.count('class="number') == 4 and text.count('class="text') == 8
 
 
 def test_paragraphs_before_the_first_heading_stand_above_the_contents():

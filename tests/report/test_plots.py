@@ -85,7 +85,7 @@ def test_ellipses_are_as_long_as_the_standard_deviations_of_the_table():
     tables = Tables(adjusted("cross"))
     axes = plot_error_ellipses(tables, Figure().add_subplot())
     (drawn,) = [child for child in axes.get_children() if isinstance(child, EllipseCollection)]
-    factor = float(axes.get_title(loc="left").split(", ")[1].split()[0])
+    factor = float(axes.get_title(loc="left").split(" x ")[1].split(", ")[0].replace(",", ""))
     a, b, turn = drawn.get_widths() / 2, drawn.get_heights() / 2, np.radians(drawn.get_angles())
     reach = np.sqrt((a * [np.cos(turn), np.sin(turn)]) ** 2 + (b * [np.sin(turn), np.cos(turn)]) ** 2) / factor
     sigma = tables.exterior[["sigma_X_m", "sigma_Y_m", "sigma_Z_m"]].to_numpy().T

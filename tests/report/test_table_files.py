@@ -72,7 +72,7 @@ def test_yes_and_no_are_no_numbers():
 def test_units_of_a_camera_follow_its_model():
     table = Tables(adjusted("cross")).interior
     assert dict(zip(table["parameter"], table["unit"], strict=True))["k2"] == "1/mm^4"
-    assert readable(table)["parameter"].tolist()[:4] == ["c", "xp", "yp", "k1"]
+    assert readable(table)["parameter"].tolist()[:4] == ["c", "x_p", "y_p", "k1"]
     assert r"1/mm\textasciicircum 2" in to_latex(table) and "| 1/mm^2 |" in to_markdown(table)
     cv = InteriorOrientation(35.0, distortion=OpenCv(k1=0.1))
     assert [parameter_unit(cv, name) for name in ("c_mm", "k1", "b1")] == ["mm", "1", "1"]

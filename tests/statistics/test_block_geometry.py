@@ -39,8 +39,8 @@ def test_a_map_of_one_row_is_drawn_as_wide_as_its_cells():
     tables = Tables(a)
     tables.coverage = result._replace(y=result.y[:1], seen_by=result.seen_by[:1])
     plot_overlap(tables, axes)
-    box = axes.collections[0].get_datalim(axes.transData)
-    assert box.height == pytest.approx(result.step_m) and box.width == pytest.approx(len(result.x) * result.step_m)
+    left, right, bottom, top = axes.images[0].get_extent()
+    assert top - bottom == pytest.approx(result.step_m) and right - left == pytest.approx(len(result.x) * result.step_m)
 
 
 def test_the_part_of_the_format_is_that_of_random_places_inside():

@@ -11,7 +11,7 @@ from jaxphoto.georeferencing import Scanner, StripErrors
 from jaxphoto.io import clouds
 from jaxphoto.io.block_folder import whole_block
 from jaxphoto.io.block_folder.table_layout import ANGLES, XYZ
-from jaxphoto.io.result_tables import read_table
+from jaxphoto.io.result_tables import TRUTH
 from jaxphoto.io.trajectory import records_of, write_flight_csv
 from jaxphoto.observations import AXES
 from jaxphoto.parameters import AbstractParameters, numbers_of
@@ -19,7 +19,6 @@ from jaxphoto.simulation import Simulation
 from jaxphoto.simulation.flight import omega_phi_kappa
 from jaxphoto.tracing import outside_transformations
 
-FOLDER = "truth"
 CLOUD, TRAJECTORY = "cloud.laz", "trajectory.csv"
 _SCANNER = "scanner"
 _DRIFT = "trajectory_errors"
@@ -33,9 +32,9 @@ def write_simulation(simulation: Simulation, folder: str | Path) -> None:
     the errors of `write_block`.
     """
     with whole_block(simulation.block, folder) as work:
-        (work / FOLDER).mkdir()
+        (work / TRUTH).mkdir()
         for name, table in truth_tables(simulation).items():
-            table.to_csv(work / FOLDER / f"{name}.csv", index=False)
+            table.to_csv(work / TRUTH / f"{name}.csv", index=False)
         if simulation.cloud is not None and simulation.trajectory is not None:
             clouds.write_cloud(simulation.cloud, work / CLOUD)
             write_flight_csv(records_of(simulation.trajectory, TRAJECTORY), work / TRAJECTORY)
@@ -65,11 +64,6 @@ def truth_tables(simulation: Simulation) -> dict[str, pd.DataFrame]:
         if np.ptp(errors.position, axis=0).any() or errors.attitude.any():
             tables[_DRIFT] = _drift_table(errors, tuple(truth.scanner.shifts))
     return tables
-
-
-def read_truth(folder: str | Path) -> dict[str, pd.DataFrame]:
-    """Read the true values in the folder of a block; empty if the block was not simulated."""
-    return {path.stem: read_table(path) for path in sorted((Path(folder) / FOLDER).glob("*.csv"))}
 
 
 def _table(id_column: str, ids: tuple[str, ...], names: tuple[str, ...], values: np.ndarray) -> pd.DataFrame:
