@@ -11,7 +11,7 @@ import pytest
 from markupsafe import Markup
 
 import jaxphoto_command
-from jaxphoto.report import page
+from jaxphoto.report import page, plots
 from jaxphoto_command import output
 
 

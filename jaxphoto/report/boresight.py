@@ -117,6 +117,7 @@ def plot_boresight(steps: Sequence[Step], ax: Axes | None = None, *, shifts: boo
     ax.set_yticks(list(places.values()), [label(name) for name in places], fontsize=8)
     ax.set_ylim(len(places) - 0.5, -0.5)
     ax.axvline(0, color="0.4", lw=0.6)
+    ax.locator_params(axis="x", nbins=6)
     ax.set_title("shifts of strips, step 2" if shifts else "misalignment", fontsize=10)
     ax.set_xlabel("shift [m]" if shifts else "angle [deg]", fontsize=9)
     if several:

@@ -110,7 +110,9 @@ def path_words(path: str) -> str:
     """Return a parameter path in words: "kodak c [mm]" for interior[kodak].c_mm or kodak.c_mm."""
     owner, _, name = path.rpartition(".")
     kind, _, of = owner.partition("[" if "[" in owner else ".")
-    return f"{_OWNERS.get(kind, f'{kind} ')}{of.removesuffix(']')} {head_of(name)}".replace("  ", " ").strip()
+    return f"{_OWNERS.get(kind, kind.replace('_', ' ') + ' ')}{of.removesuffix(']')} {head_of(name)}".replace(
+        "  ", " "
+    ).strip()
 
 
 def head_of(name: str) -> str:
