@@ -91,11 +91,14 @@ def write_results(
     seconds: dict[str, float],
     entries: Mapping[str, Any] = MappingProxyType({}),
     record: CommandRecord | None = None,
+    *,
+    with_page: bool = True,
 ) -> None:
     """Write the files of docs/block_folder.md into `directory`. Complete results replace earlier ones.
 
     summary.json contains `seconds` (read, compile, solve, covariance) and `entries` (options and inputs). `record` is
-    the provenance in the report. Raises the errors of `whole_folder`.
+    the provenance in the report. `with_page`: write the report, which takes a third of the time. Raises the errors of
+    `whole_folder`.
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:
@@ -103,7 +106,8 @@ def write_results(
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
             # Return memory to the system: a table of millions of rows leaves hundreds of MB.
             return_freed_memory()
-        (work / "report.html").write_text(report_page(tables, verdict, record, seconds), encoding="utf-8")
+        if with_page:
+            (work / "report.html").write_text(report_page(tables, verdict, record, seconds), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
         write_summary(summary | dict(entries), work)
 
