@@ -341,7 +341,7 @@ def _sections(tables: Tables, start: InteriorOrientation | None, factor: float) 
     layout = [Plot(partial(plot_block, a), block_words(a.block), _PLAN)]
     if tables.coverage is not None:
         layout.append(Plot(partial(plots.plot_overlap, tables), "overlap: images per cell of the ground", _PLAN))
-    yield [*layout, Plot(partial(plots.plot_error_ellipses, tables), "error ellipses of projection centres", _PLAN)]
+    yield [*layout, Plot(partial(plots.plot_error_ellipses, tables), "error ellipses of object points", _PLAN)]
     yield from _residuals(tables, cameras)
     yield from points_section(tables)
     yield from _check_points(tables)
@@ -455,7 +455,10 @@ def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
         row.append(Plot(partial(plots.plot_station_residuals, tables), "residuals of stations in order of time"))
     yield row
     if len(tables.trends):
-        yield Paragraph("Systematic residuals, by image format, time and strip:")
+        yield Paragraph(
+            "Systematic residuals, by image format, time and strip. Fraction: part of the sum of squares of the effect "
+            "that is due to the named term."
+        )
         yield without_empty(readable(tables.trends)).rename(columns=_EFFECTS)
     largest = tables.residuals.loc[tables.checked_w.abs().nlargest(_LARGEST).index]
     yield Paragraph(
