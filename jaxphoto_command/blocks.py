@@ -52,6 +52,7 @@ def adjust(
         str | None,
         Option(help="Estimate variance components by group, or comma-separated by xy-z, axis, camera, image."),
     ] = None,
+    no_report: Annotated[bool, Option("--no-report", help="Write tables only, without report.html.")] = False,
 ) -> None:
     """Adjust a block and write tables, statistics and a report.
 
@@ -72,7 +73,8 @@ def adjust(
         raise typer.BadParameter(f"--weights {unknown[0]}: choose from group, {', '.join(SPLITS)}.")
     splits = tuple(name for name in splits if name != "group")
     check_folder(out, block)
-    Thread(target=report.prepare_pictures, daemon=True).start()
+    if not no_report:
+        Thread(target=report.prepare_pictures, daemon=True).start()
     start = time.perf_counter()
     with output.progress("reading the block") as progress:
         read = read_block(block)
@@ -101,7 +103,8 @@ def adjust(
         times = {name: times[name] for name in ("read", "start", "compile", "solve", "covariance") if name in times}
         with whole_folder(out) as work:
             source = "block" if snooped else os.path.relpath(block.resolve(), out.resolve())
-            report.write_results(tables, verdict, work, times, {"block": source, **output.options()}, record)
+            entries = {"block": source, **output.options()}
+            report.write_results(tables, verdict, work, times, entries, record, with_page=not no_report)
             provenance.write(read.images, work)
             for name, table in (report.component_tables(components) if components else {}).items():
                 table.to_csv(work / f"{name}.csv", index=False)
@@ -111,7 +114,7 @@ def adjust(
     report.print_adjustment(tables, verdict, output.screen)
     if components:
         report.print_components(components, output.screen)
-    output.wrote(out, f"results in {out} (open report.html)")
+    output.wrote(out, f"results in {out}{'' if no_report else ' (open report.html)'}")
     if verdict.severity == "error":
         raise typer.Exit(1)
 

@@ -277,6 +277,7 @@ def plot_station_residuals(tables: Tables, ax: Axes | None = None) -> Axes:
     for level, style in ((0.0, "-"), (-_BARS * sigma, ":"), (_BARS * sigma, ":")):
         ax.axhline(level, color="0.6", lw=0.6, ls=style)
     ax.set(xlabel=f"image, in the order of {'time' if timed else 'the block'}", ylabel="residual [m]")
+    ax.locator_params(axis="x", integer=True)
     title(ax, f"residuals of stations; dotted: {_BARS:g} sigma")
     ax.legend(fontsize=7)
     return ax
@@ -409,7 +410,9 @@ def draw_distortion(axes: Axes, curve: DistortionCurve, factor: float = 1.0) -> 
 # Block -----------------------------------------------------------------------------------------------------------
 
 # Length of the major axis of the median error ellipse, as a fraction of the extent of the block.
-_ELLIPSE = 0.045
+_ELLIPSE = 0.03
+# Maximum number of ellipses.
+_ELLIPSES = 400
 
 
 def ellipse_axes(
@@ -423,30 +426,35 @@ def ellipse_axes(
 
 
 def plot_error_ellipses(tables: Tables, ax: Axes | None = None) -> Axes:
-    """Draw enlarged standard ellipses (39 % probability) of the projection centres in plan; colour: sigma of Z."""
+    """Draw enlarged standard ellipses (39 % probability) of the object points in plan; colour: sigma of Z.
+
+    Points that no image determines are skipped; of many points, every n-th is drawn.
+    """
     from matplotlib.collections import EllipseCollection
 
-    ax, covariance = axes_or_new(ax), tables.covariance.positions * float(tables.covariance.variance_factor)
-    unit = tables.unit
-    at = np.asarray(tables.adjusted.unknowns.exterior.position)
-    ax.plot(*at[:, :2].T, "+", ms=4, color="0.4")
-    name = "error ellipses of projection centres"
-    known = np.flatnonzero(np.isfinite(covariance).all(axis=(1, 2)))
-    a, b, direction = ellipse_axes(covariance[known][:, :2, :2])
-    if (a > 0).any():
-        extent = max(float(np.ptp(at[:, :2], axis=0).max()), float(np.median(a[a > 0])))
-        factor = max(1.0, float(f"{_ELLIPSE * extent / np.median(a[a > 0]):.0e}"))
+    ax, covariance = axes_or_new(ax), tables.covariance.points * float(tables.covariance.variance_factor)
+    unit, a = tables.unit, tables.adjusted
+    at, station = np.asarray(a.unknowns.points), np.asarray(a.unknowns.exterior.position)
+    ax.plot(*station[:, :2].T, "+", ms=5, color="0.75")
+    name = "error ellipses of object points"
+    measured = np.bincount(a.structure.point, minlength=len(at)) > 0
+    known = np.flatnonzero(measured & np.isfinite(covariance).all(axis=(1, 2)))
+    known = known[:: -(-len(known) // _ELLIPSES) or 1]
+    major, minor, direction = ellipse_axes(covariance[known][:, :2, :2])
+    if (major > 0).any():
+        extent = max(float(np.ptp(at[:, :2], axis=0).max()), float(np.median(major[major > 0])))
+        factor = max(1.0, float(f"{_ELLIPSE * extent / np.median(major[major > 0]):.0e}"))
         ellipses = EllipseCollection(
-            2 * factor * a, 2 * factor * b, np.degrees(direction), units="xy", offsets=at[known, :2],
+            2 * factor * major, 2 * factor * minor, np.degrees(direction), units="xy", offsets=at[known, :2],
             offset_transform=ax.transData, array=np.sqrt(np.maximum(covariance[known, 2, 2], 0.0)),
             cmap="cividis", alpha=0.7,
         )  # fmt: skip
         ax.add_collection(ellipses)
-        reach = factor * a[:, None] * np.ones(2)
+        reach = factor * major[:, None] * np.ones(2)
         ax.update_datalim(np.concatenate([at[known, :2] - reach, at[known, :2] + reach]))
         ax.autoscale_view()
         ax.figure.colorbar(ellipses, ax=ax, shrink=0.8, label=f"sigma of Z [{unit}]")
-        name = f"error ellipses x {factor:,.0f}, largest {a.max():.2g} {unit}"
+        name = f"error ellipses x {factor:,.0f}, largest {major.max():.2g} {unit}"
     ax.set(xlabel=f"X [{unit}]", ylabel=f"Y [{unit}]")
     title(ax, name)
     ax.set_aspect("equal", adjustable="datalim")

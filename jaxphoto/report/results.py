@@ -91,11 +91,14 @@ def write_results(
     seconds: dict[str, float],
     entries: Mapping[str, Any] = MappingProxyType({}),
     record: CommandRecord | None = None,
+    *,
+    with_page: bool = True,
 ) -> None:
     """Write the files of docs/block_folder.md into `directory`. Complete results replace earlier ones.
 
     summary.json contains `seconds` (read, compile, solve, covariance) and `entries` (options and inputs). `record` is
-    the provenance in the report. Raises the errors of `whole_folder`.
+    the provenance in the report. `with_page`: write the report, which takes a third of the time. Raises the errors of
+    `whole_folder`.
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:
@@ -103,7 +106,8 @@ def write_results(
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
             # Return memory to the system: a table of millions of rows leaves hundreds of MB.
             return_freed_memory()
-        (work / "report.html").write_text(report_page(tables, verdict, record, seconds), encoding="utf-8")
+        if with_page:
+            (work / "report.html").write_text(report_page(tables, verdict, record, seconds), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
         write_summary(summary | dict(entries), work)
 
@@ -337,7 +341,7 @@ def _sections(tables: Tables, start: InteriorOrientation | None, factor: float) 
     layout = [Plot(partial(plot_block, a), block_words(a.block), _PLAN)]
     if tables.coverage is not None:
         layout.append(Plot(partial(plots.plot_overlap, tables), "overlap: images per cell of the ground", _PLAN))
-    yield [*layout, Plot(partial(plots.plot_error_ellipses, tables), "error ellipses of projection centres", _PLAN)]
+    yield [*layout, Plot(partial(plots.plot_error_ellipses, tables), "error ellipses of object points", _PLAN)]
     yield from _residuals(tables, cameras)
     yield from points_section(tables)
     yield from _check_points(tables)
@@ -451,7 +455,10 @@ def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
         row.append(Plot(partial(plots.plot_station_residuals, tables), "residuals of stations in order of time"))
     yield row
     if len(tables.trends):
-        yield Paragraph("Systematic residuals, by image format, time and strip:")
+        yield Paragraph(
+            "Systematic residuals, by image format, time and strip. Fraction: part of the sum of squares of the effect "
+            "that is due to the named term."
+        )
         yield without_empty(readable(tables.trends)).rename(columns=_EFFECTS)
     largest = tables.residuals.loc[tables.checked_w.abs().nlargest(_LARGEST).index]
     yield Paragraph(

@@ -295,10 +295,10 @@ def ground_findings(tables: Tables) -> Iterator[Finding]:
             if abs(rho[k]) > HIGH_CORRELATION:
                 sigma = tables.interior.set_index(["camera", "parameter"])["sigma"][camera, "c_mm"]
                 what = ("the height of the ground", "the distance of the images from the ground")[k]
-                numbers = {"what": what, "sigma": sigma, "effect": abs(rho[k]) * g.sigma_m[k]}
+                numbers = {"what": what, "sigma": sigma, "effect": abs(rho[k]) * g.sigma_m[k], "unit": tables.unit}
                 yield Finding("ground_c", "note", words, float(rho[k]), HIGH_CORRELATION, numbers=numbers)
         if dome > HIGH_CORRELATION:
-            numbers = {"effect": g.sigma_m[FORMS.index("dome")]}
+            numbers = {"effect": g.sigma_m[FORMS.index("dome")], "unit": tables.unit}
             yield Finding("ground_dome", "note", words, dome, HIGH_CORRELATION, numbers=numbers)
 
 

@@ -88,7 +88,8 @@ def test_ellipses_are_as_long_as_the_standard_deviations_of_the_table():
     factor = float(axes.get_title(loc="left").split(" x ")[1].split(", ")[0].replace(",", ""))
     a, b, turn = drawn.get_widths() / 2, drawn.get_heights() / 2, np.radians(drawn.get_angles())
     reach = np.sqrt((a * [np.cos(turn), np.sin(turn)]) ** 2 + (b * [np.sin(turn), np.cos(turn)]) ** 2) / factor
-    sigma = tables.exterior[["sigma_X_m", "sigma_Y_m", "sigma_Z_m"]].to_numpy().T
+    measured = tables.object_points[tables.object_points["n_images"] > 0]
+    sigma = measured[["sigma_X_m", "sigma_Y_m", "sigma_Z_m"]].to_numpy().T
     np.testing.assert_allclose(reach, sigma[:2], rtol=1e-9)
     np.testing.assert_allclose(drawn.get_array(), sigma[2], rtol=1e-9)
 
