@@ -432,8 +432,8 @@ def plot_error_ellipses(tables: Tables, ax: Axes | None = None) -> Axes:
     """
     from matplotlib.collections import EllipseCollection
 
-    ax, covariance = axes_or_new(ax), tables.covariance.points * float(tables.covariance.variance_factor)
-    unit, a = tables.unit, tables.adjusted
+    covariance = np.asarray(tables.covariance.points) * float(tables.covariance.variance_factor)
+    ax, unit, a = axes_or_new(ax), tables.unit, tables.adjusted
     at, station = np.asarray(a.unknowns.points), np.asarray(a.unknowns.exterior.position)
     ax.plot(*station[:, :2].T, "+", ms=5, color="0.75")
     name = "error ellipses of object points"
