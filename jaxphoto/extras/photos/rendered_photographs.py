@@ -21,7 +21,7 @@ BOARD = "chessboard:8x6:square_mm=30"
 SENSOR = Sensor(640, 480, 0.006)
 BOARD_CAMERA = InteriorOrientation(3.6, 0.03, -0.02, Smac(k1=-0.002))
 FLIGHT_CAMERA = InteriorOrientation(3.6, 0.02, -0.01, Brown(k1=5e-3))
-GROUND_PIXEL_M = 0.05
+GROUND_M = 0.05
 """Pixel of the ground texture (m)."""
 _PLACE = (13.2, 55.7, 100.0)
 _VIEWS, _PHOTOGRAPHS = 10, 12
@@ -37,20 +37,20 @@ def write_board(folder: Path) -> None:
     """Write ten views of a chessboard (`BOARD`) by `BOARD_CAMERA`."""
     pattern = read_board(BOARD)
     for k in range(_VIEWS):
-        above = board_view(pattern.board, k, 0.42)
+        above = board_view(pattern.board, k, 1.5)
         picture = rendered(pattern, SENSOR, BOARD_CAMERA, above, noise=3.0, rays=13, seed=k)
         _save(folder / f"board_{k + 1:02}.jpg", picture)
 
 
-def board_view(board: Board, k: int, away_m: float = 0.28) -> ExteriorOrientation:
-    """Return the orientation of view `k`: towards the board's centre, tilted by 0.5 rad, rotated about the axis."""
-    toward = np.array([0.13 * np.cos(1.7 * k + 0.3), 0.13 * np.sin(1.7 * k + 0.3), 0.25])
-    z = toward / np.linalg.norm(toward)
+def board_view(board: Board, k: int, factor: float = 1.0) -> ExteriorOrientation:
+    """Return the orientation of view `k` from `factor` times 0.28 m: tilted by 0.5 rad, rotated about the axis."""
+    away = factor * np.array([0.13 * np.cos(1.7 * k + 0.3), 0.13 * np.sin(1.7 * k + 0.3), 0.25])
+    z = away / np.linalg.norm(away)
     x = np.cross([0.0, 1.0, 0.0], z)
     x /= np.linalg.norm(x)
     c, s = np.cos(0.35 * k + 0.2), np.sin(0.35 * k + 0.2)
     turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    return ExteriorOrientation(board.xyz_m.mean(axis=0) + away_m * z, turn @ np.stack([x, np.cross(z, x), z]))  # type: ignore[arg-type]
+    return ExteriorOrientation(board.xyz_m.mean(axis=0) + away, turn @ np.stack([x, np.cross(z, x), z]))  # type: ignore[arg-type]
 
 
 def write_flight(folder: Path) -> None:
@@ -72,7 +72,9 @@ def write_flight(folder: Path) -> None:
         _save(path, picture, frame.place(frame.map(recorded[None]))[0])
         n = len(surveyed)
         xy = projections(FLIGHT_CAMERA, np.tile(position, (n, 1)), np.tile(rotation, (n, 1, 1)), surveyed)
-        for point, mark in zip(frame.map(surveyed), SENSOR.px_from_mm(xy) - 0.5 + rng.normal(0, 0.1, (n, 2)), strict=True):
+        for point, mark in zip(
+            frame.map(surveyed), SENSOR.px_from_mm(xy) - 0.5 + rng.normal(0, 0.1, (n, 2)), strict=True
+        ):
             if (mark > 3).all() and (mark < (SENSOR.width_px - 4, SENSOR.height_px - 4)).all():
                 lines.append(" ".join(f"{v:.3f}" for v in (*point, *mark)) + f" {path.name}")
     (folder / "gcp_list.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -106,7 +108,7 @@ def rendered_ground(
         along = (ground_height(x, y) - position[2]) / ray[:, 2]
         x, y = position[0] + along * ray[:, 0], position[1] + along * ray[:, 1]
     middle = len(texture) / 2 - 0.5
-    maps = np.stack([middle + x / GROUND_PIXEL_M, middle - y / GROUND_PIXEL_M]).reshape(2, *column.shape)
+    maps = np.stack([middle + x / GROUND_M, middle - y / GROUND_M]).reshape(2, *column.shape)
     grey = cv2.remap(texture.astype(np.float32), *maps.astype(np.float32), cv2.INTER_CUBIC)
     return np.clip(np.round(grey + _NOISE_GREY * rng.normal(size=grey.shape)), 0, 255).astype(np.uint8)
 
