@@ -65,16 +65,15 @@ def write_flight(folder: Path) -> None:
     for k in range(_PHOTOGRAPHS):
         position = np.array([14.0 * (k % 4) - 21, 14.0 * (k // 4) - 14, 60.0 + 8 * (k % 3)])
         angles = np.deg2rad([*rng.uniform(-14, 14, 2), 90.0 * (k % 4)])
-        rotation = np.asarray(matrix_from_omega_phi_kappa(angles))
+        rotation = np.asarray(matrix_from_omega_phi_kappa(angles))  # type: ignore[arg-type]
         picture = rendered_ground(texture, FLIGHT_CAMERA, position, rotation, rng)
         recorded = position + rng.normal(0, _POSITION_M, 3)
         path = folder / f"flight_{k + 1:02}.jpg"
         _save(path, picture, frame.place(frame.map(recorded[None]))[0])
         n = len(surveyed)
         xy = projections(FLIGHT_CAMERA, np.tile(position, (n, 1)), np.tile(rotation, (n, 1, 1)), surveyed)
-        for point, mark in zip(
-            frame.map(surveyed), SENSOR.px_from_mm(xy) - 0.5 + rng.normal(0, 0.1, (n, 2)), strict=True
-        ):
+        marks = SENSOR.px_from_mm(xy) - 0.5 + rng.normal(0, 0.1, (n, 2))
+        for point, mark in zip(frame.map(surveyed), marks, strict=True):
             if (mark > 3).all() and (mark < (SENSOR.width_px - 4, SENSOR.height_px - 4)).all():
                 lines.append(" ".join(f"{v:.3f}" for v in (*point, *mark)) + f" {path.name}")
     (folder / "gcp_list.txt").write_text("\n".join(lines) + "\n", encoding="utf-8")
@@ -108,8 +107,8 @@ def rendered_ground(
         along = (ground_height(x, y) - position[2]) / ray[:, 2]
         x, y = position[0] + along * ray[:, 0], position[1] + along * ray[:, 1]
     middle = len(texture) / 2 - 0.5
-    maps = np.stack([middle + x / GROUND_M, middle - y / GROUND_M]).reshape(2, *column.shape)
-    grey = cv2.remap(texture.astype(np.float32), *maps.astype(np.float32), cv2.INTER_CUBIC)
+    right, down = ((middle + v / GROUND_M).reshape(column.shape).astype(np.float32) for v in (x, -y))
+    grey = cv2.remap(texture.astype(np.float32), right, down, cv2.INTER_CUBIC)
     return np.clip(np.round(grey + _NOISE_GREY * rng.normal(size=grey.shape)), 0, 255).astype(np.uint8)
 
 
