@@ -38,7 +38,7 @@ def block_of(problem: Problem, title: str) -> Block:
     p = problem
     n_images, n_points = len(p.init_eop), len(p.init_pts)
     c, x_p, y_p, k1, k2 = map(float, SIGN * p.init_iop)
-    camera = InteriorOrientation(c, x_p, y_p, Brown(k1=k1, k2=k2))
+    camera = InteriorOrientation(c, x_p, y_p, Brown(k1=k1, k2=k2), residuals="model")  # as the other solvers
     exterior = ExteriorOrientation.from_angles(p.init_eop[:, 3:], p.init_eop[:, :3])
     start = Unknowns({"cam": camera}, exterior, p.init_pts, {}, {})
     priors = default_priors(start)

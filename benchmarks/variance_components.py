@@ -7,7 +7,6 @@ four parts; every flight's components are set beside the true ones.
 """
 
 import argparse
-import dataclasses
 import time
 from pathlib import Path
 
@@ -30,13 +29,8 @@ TRUE = {"image points": 1.5, "control": 6.0, "stations X-Y": 6.0, "stations Z": 
 
 
 def flight(folder: Path = EXAMPLE) -> tuple[Block, Unknowns]:
-    """The example block, and its estimates for truth; residuals are of measured coordinates, as the noise is."""
+    """The example block, and its estimates for truth."""
     block = read_block(folder)
-    measured = lambda tree: jax.tree.map(  # noqa: E731
-        lambda camera: dataclasses.replace(camera, residuals="measured"), tree, is_leaf=lambda x: hasattr(x, "x_p")
-    )
-    where = lambda b: (b.start.unknowns.interior, b.priors.interior)  # noqa: E731
-    block = eqx.tree_at(where, block, tuple(map(measured, where(block))))
     return block, adjust(block).unknowns
 
 

@@ -12,12 +12,16 @@ from jaxphoto_command.application import command
 from jaxphoto_command.output import Output
 
 PANEL = "Camera comparison"
+_TWO_CALIBRATIONS = (
+    "jaxphoto example recipe && for k in 1 2; do jaxphoto simulate recipe.toml --seed $k --out block_$k && "
+    "jaxphoto adjust block_$k --out results_$k; done && "
+)
 CameraA = Annotated[Path, Argument(metavar="A", help="Results or camera file of one calibration.")]
 CameraFileB = Annotated[Path, Argument(metavar="B", help="Results or camera file of the other calibration.")]
 OptionalOut = Annotated[Path | None, Option(help="Output folder for tables, figures and report.")]
 
 
-@command("stability", PANEL, "jaxphoto stability camera_2025 camera_2026 --out stability")
+@command("stability", PANEL, f"{_TWO_CALIBRATIONS}jaxphoto stability results_1 results_2 --out stability")
 def stability(
     output: Output,
     first: CameraA,
@@ -56,7 +60,7 @@ def stability(
         output.wrote(out, f"results in {out} (open report.html)")
 
 
-@command("compare", PANEL, "jaxphoto compare results_2025 results_2026")
+@command("compare", PANEL, f"{_TWO_CALIBRATIONS}jaxphoto compare results_1 results_2 --out change")
 def compare(
     output: Output,
     first: CameraA,

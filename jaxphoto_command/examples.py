@@ -11,7 +11,7 @@ from jaxphoto_command.application import command
 from jaxphoto_command.output import Output
 
 PANEL = "Examples and simulation"
-_SIMULATED = ("lidar", "strips")
+_SIMULATED, _RENDERED = ("lidar", "strips"), ("photographs", "board")
 NEXT = {
     "cross_block": "jaxphoto adjust OUT --out results",
     "recipe": "jaxphoto simulate OUT --out block",
@@ -19,6 +19,8 @@ NEXT = {
     "lidar": "jaxphoto simultaneous OUT OUT/cloud.laz --trajectory OUT/trajectory.csv --out both",
     "strips": "jaxphoto strips OUT/cloud.laz --trajectory OUT/trajectory.csv --block OUT "
     "--adjust boresight,range-offset,angle-scale --cell-m 8 --knots-s 5 --out joint",
+    "photographs": "jaxphoto fly OUT --features 1000 --out flight",
+    "board": "jaxphoto calibrate OUT/*.jpg --board chessboard:8x6:square_mm=30 --out camera",
     "experiments": "jaxphoto experiment 000 --experiments OUT --layouts 4 --out runs",
 }
 """Next command for each example. OUT is replaced by the path of the example."""
@@ -32,11 +34,12 @@ def example(
     ] = None,
     out: Annotated[Path | None, Option(help="Path to write (default: NAME or NAME.toml).")] = None,
 ) -> None:
-    """Write an example block, recipe or experiment."""
+    """Write an example block, recipe, experiment or set of photographs."""
     import shutil
 
     from jaxphoto.io import read_recipe, write_simulation
     from jaxphoto.io.shipped import EXAMPLES, shipped
+    from jaxphoto.optional import extra
     from jaxphoto.simulation import simulate
     from jaxphoto.writing import check_file, check_folder, whole_file, whole_folder
 
@@ -45,11 +48,17 @@ def example(
         output.add(examples=dict(EXAMPLES))
         return
     source = shipped(name)
-    target = out if out is not None else Path(name if source.is_dir() or name in _SIMULATED else source.name)
+    made = name in _SIMULATED or name in _RENDERED
+    target = out if out is not None else Path(name if source.is_dir() or made else source.name)
     if name in _SIMULATED:
         check_folder(target, source)
         with output.progress("simulating"):
             write_simulation(simulate(read_recipe(source)), target)
+    elif name in _RENDERED:
+        with extra():
+            from jaxphoto.extras.photos.rendered_photographs import write_board, write_flight
+        with output.progress("rendering"), whole_folder(target) as work:
+            {"photographs": write_flight, "board": write_board}[name](work)
     elif source.is_dir():
         check_folder(target)
         with whole_folder(target) as work:

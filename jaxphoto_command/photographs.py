@@ -15,10 +15,11 @@ from jaxphoto_command.application import command
 from jaxphoto_command.output import Output
 
 PANEL = "Photographs"
+_EXAMPLE = "jaxphoto example photographs && "
 _CONTROL = "gcp_list.txt, markers of Metashape, CSV, table of Pix4D"
 
 
-@command("fly", PANEL, "jaxphoto fly photographs --out flight")
+@command("fly", PANEL, f"{_EXAMPLE}jaxphoto fly photographs --features 1000 --out flight")
 def fly(
     output: Output,
     photographs: opt.Photographs,
@@ -175,7 +176,12 @@ def fly(
         raise typer.Exit(1)
 
 
-@command("control", PANEL, "jaxphoto control flight/block gcp_list.txt --out controlled")
+@command(
+    "control",
+    PANEL,
+    f"{_EXAMPLE}jaxphoto orient photographs/*.jpg --features 1000 --out block && "
+    "jaxphoto control block photographs/gcp_list.txt --out controlled",
+)
 def control(
     output: Output,
     block: Annotated[Path, Argument(help="Block folder with oriented images.")],
@@ -241,7 +247,7 @@ def control(
 @command(
     "calibrate",
     PANEL,
-    "jaxphoto calibrate board/*.jpg --board chessboard:8x6:square_mm=30 --out camera",
+    "jaxphoto example board && jaxphoto calibrate board/*.jpg --board chessboard:8x6:square_mm=30 --out camera",
     "Boards: chessboard:8x6:square_mm=30, circles:4x11:spacing_mm=20:diameter_mm=15, "
     "charuco:7x5:square_mm=30:marker_mm=22:dictionary=4X4_50.",
 )
@@ -320,7 +326,7 @@ def calibrate(
         raise typer.Exit(1)
 
 
-@command("orient", PANEL, "jaxphoto orient photographs/*.jpg --out BLOCK")
+@command("orient", PANEL, f"{_EXAMPLE}jaxphoto orient photographs/*.jpg --features 1000 --out block")
 def orient(
     output: Output,
     images: Annotated[list[Path], Argument(help="Photographs of one camera.")],

@@ -21,7 +21,7 @@ from jaxphoto.statistics import redundancy_numbers
 from jaxphoto.unknowns import default_priors
 
 NAMES = ("c_mm", "xp_mm", "yp_mm", "k1", "k2")
-# The baselines add k1 and k2, Brown subtracts them.
+# The baselines add k1 and k2, Brown subtracts them; their residuals are those of corrected coordinates.
 SIGN = np.array([1.0, 1.0, 1.0, -1.0, -1.0])
 
 
@@ -44,7 +44,7 @@ def block_of(npz: Path) -> Block:
     order = np.lexsort((d["obs_img"], d["obs_pt"]))
     c, x_p, y_p, k1, k2 = SIGN * d["init_iop"]
     start = Unknowns(
-        {"cam": InteriorOrientation(c, x_p, y_p, Brown(k1=k1, k2=k2))},
+        {"cam": InteriorOrientation(c, x_p, y_p, Brown(k1=k1, k2=k2), residuals="model")},
         ExteriorOrientation.from_angles(d["init_eop"][:, 3:], d["init_eop"][:, :3]),
         d["init_pts"],
         {},

@@ -9,10 +9,11 @@ import pandas as pd
 import pytest
 
 import jaxphoto
+from jaxphoto.extras.photos.rendered_photographs import board_view
 from jaxphoto.extras.photos.targets import read_board, rendered
 from jaxphoto.procedures.calibration import target_calibration
 from tests.commands import run
-from tests.photos.test_targets import LENS, SENSOR, view
+from tests.photos.test_targets import LENS, SENSOR
 
 BOARD = "chessboard:8x5:square_mm=22"
 IMAGES = 5
@@ -24,7 +25,7 @@ def folder(tmp_path_factory):
     out = tmp_path_factory.mktemp("photographs")
     pattern = read_board(BOARD)
     for k in range(IMAGES):
-        picture = rendered(pattern, SENSOR, LENS, view(pattern.board, k), noise=3.0, rays=13, seed=k)
+        picture = rendered(pattern, SENSOR, LENS, board_view(pattern.board, k), noise=3.0, rays=13, seed=k)
         cv2.imwrite(str(out / f"p{k}.png"), picture)
     cv2.imwrite(str(out / "wall.png"), np.full((SENSOR.height_px, SENSOR.width_px), 120, np.uint8))
     return out

@@ -100,7 +100,8 @@ def _python(page: Path) -> list[str]:
     "page", slow_but(lambda p: p.stem not in LONG, [p for p in PAGES if _python(p)]), ids=lambda p: p.name
 )
 def test_python_on_pages_runs(page: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.chdir(ROOT)
+    # Readme's user has a clone, the other pages' user the files of `jaxphoto example`.
+    monkeypatch.chdir(ROOT if page.parent == ROOT else EXAMPLES)
     # Commands and formats that a page registers are removed afterwards.
     monkeypatch.setattr(app, "registered_commands", list(app.registered_commands))
     names: dict[str, object] = {"__name__": page.stem}

@@ -8,11 +8,12 @@ import pandas as pd
 import pytest
 from PIL import Image
 
+from jaxphoto.extras.photos.rendered_photographs import SENSOR, ground_texture
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io import read_block
 from jaxphoto.procedures.georeference_photographs import utm_of
 from tests.commands import run
-from tests.photos.ground import SENSOR, photograph, texture
+from tests.photos.ground import photograph
 
 ORIGIN = (13.2, 55.7, 0.0)
 PIXEL_MM, C_MM = SENSOR.pixel_mm, 3.6
@@ -39,7 +40,7 @@ def flown(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("flown"), np.random.default_rng(4)
     frame = MapFrame(utm_of(*ORIGIN[:2]), None, ORIGIN)
     for name, far, number in (("a", 0.0, 12), ("b", 5000.0, 3)):
-        ground = texture(rng, 2400).astype(np.float32)
+        ground = ground_texture(rng, 2400).astype(np.float32)
         for k in range(number):
             at = np.array([14.0 * (k % 4) - 21, 14.0 * (k // 4) - 14, HEIGHT_M + 8 * (k % 3)])
             angles = (*rng.uniform(-14, 14, 2), 90.0 * (k % 4))

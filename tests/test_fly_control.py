@@ -7,10 +7,11 @@ import numpy as np
 import pandas as pd
 import pytest
 
+from jaxphoto.extras.photos.rendered_photographs import SENSOR, ground_texture
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.io import read_block
 from tests.commands import run
-from tests.photos.ground import SENSOR, mapped, photograph, texture
+from tests.photos.ground import mapped, photograph
 from tests.procedures.controlled import CODE, ORIGIN
 from tests.test_fly_command import C_MM, PIXEL_MM, with_position
 
@@ -27,7 +28,7 @@ def flown(tmp_path_factory):
     folder, rng = tmp_path_factory.mktemp("flown"), np.random.default_rng(4)
     (folder / "photographs").mkdir()
     frame = MapFrame(CODE, None, ORIGIN)
-    ground = 0.7 * texture(rng, 2400).astype(np.float32) + 40
+    ground = 0.7 * ground_texture(rng, 2400).astype(np.float32) + 40
     marks = []
     for k in range(12):
         at = np.array([14.0 * (k % 4) - 21, 14.0 * (k // 4) - 14, 60.0 + 8 * (k % 3)])

@@ -10,12 +10,13 @@ import pytest
 from scipy.stats import chi2
 
 from jaxphoto import adjust, covariance
+from jaxphoto.extras.photos.rendered_photographs import GROUND_M, SENSOR, ground_height, ground_texture
 from jaxphoto.io import read_block
 from jaxphoto.procedures.orientation.blocks import similarity_between
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from tests.commands import run
 from tests.formulas import camera_from_object
-from tests.photos.ground import C_MM, GROUND_M, SENSOR, texture
+from tests.photos.ground import C_MM
 
 pytestmark = pytest.mark.slow
 
@@ -31,11 +32,6 @@ STATIONS = [
 ]
 
 
-def height(x, y):
-    """Bumps of some metres, gentle enough that every ray meets the ground once."""
-    return 4 * np.sin(x / 9) * np.cos(y / 11) + 3 * np.cos(x / 17 + 1) + 2.5 * np.sin((x + 2 * y) / 14)
-
-
 def rendered(ground, position, matrix, rng):
     """What the camera sees: the ray of each pixel, followed to the ground."""
     column, row = np.meshgrid(np.arange(SENSOR.width_px) + 0.5, np.arange(SENSOR.height_px) + 0.5)
@@ -45,9 +41,9 @@ def rendered(ground, position, matrix, rng):
     ray = np.column_stack([ideal, np.full(len(xy), -C_MM)]) @ matrix
     x, y = np.zeros((2, len(xy)))
     for _ in range(25):
-        far = (height(x, y) - position[2]) / ray[:, 2]
+        far = (ground_height(x, y) - position[2]) / ray[:, 2]
         x, y = position[0] + far * ray[:, 0], position[1] + far * ray[:, 1]
-    assert np.abs(position[2] + far * ray[:, 2] - height(x, y)).max() < 1e-3
+    assert np.abs(position[2] + far * ray[:, 2] - ground_height(x, y)).max() < 1e-3
     middle = len(ground) / 2 - 0.5
     there = np.stack([middle + x / GROUND_M, middle - y / GROUND_M]).reshape(2, *column.shape).astype(np.float32)
     assert there.min() > 0 and there.max() < len(ground) - 1
@@ -59,7 +55,7 @@ def rendered(ground, position, matrix, rng):
 def photographed(tmp_path_factory):
     """The files, and the truth of their stations and rotations."""
     folder, rng = tmp_path_factory.mktemp("ground"), np.random.default_rng(2)
-    ground = texture(rng, 2600).astype(np.float32)
+    ground = ground_texture(rng, 2600).astype(np.float32)
     positions = np.array([at for at, _ in STATIONS], float)
     matrices = np.stack([camera_from_object(*np.deg2rad(angles)) for _, angles in STATIONS])
     paths = [folder / f"view{k}.png" for k in range(len(STATIONS))]

@@ -27,15 +27,15 @@ class InteriorOrientation(eqx.Module):
     distortion.ideal_from_measured(measured - (x_p, y_p))`; for a `normalised` distortion both are divided by c
     (docs/conventions.md).
 
-    `residuals` selects the image to which residuals refer: the image in which the distortion has a closed form, or
-    always the measured image, which contains the noise. The two differ where a wide-angle lens stretches the image.
+    `residuals` selects the image to which residuals refer: "measured", which contains the noise, or "model", the image
+    in which the distortion has a closed form. The two differ where the distortion stretches the image.
     """
 
     c: Float[Array, ""] | float
     x_p: Float[Array, ""] | float = 0.0
     y_p: Float[Array, ""] | float = 0.0
     distortion: AbstractDistortion = dataclasses.field(default_factory=Brown)
-    residuals: Literal["model", "measured"] = eqx.field(static=True, default="model")
+    residuals: Literal["model", "measured"] = eqx.field(static=True, default="measured")
     projection: AbstractProjection = dataclasses.field(default_factory=Perspective)
     rows: RowMotion | None = None
     """Motion of the camera during the exposure of the rows; only set within an adjustment with `RollingShutter`."""

@@ -11,6 +11,8 @@ EXAMPLES = {
     "boresight": "a recipe to simulate: a flight to estimate the misalignment between camera and IMU",
     "lidar": "a simulated flight of camera and lidar: block, cloud, trajectory, and the truth",
     "strips": "a simulated flight of overlapping strips of a scanner and a camera on one trajectory, all with errors",
+    "photographs": "rendered photographs of a flight with positions in EXIF, and surveyed points with their marks",
+    "board": "rendered photographs of a chessboard",
     "experiments": "the published experiments as runnable declarations",
 }
 """Examples and their descriptions."""

@@ -121,7 +121,7 @@ def stretch_findings(adjusted: Adjustment) -> Iterator[Finding]:
     """Yield cameras whose distortion scales residuals, so that the expected sigma naught differs from 1."""
     for camera, factor in statistics.expected_residual_scale(adjusted).items() if adjusted.redundancy > 0 else ():
         if abs(factor - 1) > _STRETCHED:
-            hint = f'Set residuals = "measured" in [cameras.{camera}]'
+            hint = f'Remove residuals = "model" from [cameras.{camera}]'
             yield Finding("stretched", "note", camera_words(camera), factor, 1.0, hint)
 
 

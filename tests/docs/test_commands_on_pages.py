@@ -1,4 +1,4 @@
-"""Every command line on the pages is one that the program knows; those that need no file of others run, to the end."""
+"""Every command line on the pages is one that the program knows, and its inputs are made on the page."""
 
 import re
 import shlex
@@ -9,11 +9,14 @@ from typer.main import get_command
 
 from jaxphoto_command import app
 from tests.commands import run_script
+from tests.docs.shell_blocks import USERS_OWN
 
 COMMANDS = get_command(app).commands
 ROOT = Path(__file__).resolve().parents[2]
 # extending.md declares commands of its own.
 PAGES = [ROOT / "README.md", *sorted(p for p in (ROOT / "docs").rglob("*.md") if p.stem != "extending")]
+# Parameters that name what is written; `second` is the target of `convert` and `camera` without --out.
+_OUTPUT = {"out", "second"}
 _LISTING = re.compile(r"^```(?:sh)?\n(.*?)^```", re.MULTILINE | re.DOTALL)
 
 
@@ -38,6 +41,21 @@ def test_command_lines_are_commands_with_options_that_exist(page):
         # What may be left out stands in brackets, with words for what the user puts there.
         if "[" not in line:
             known.make_context(command, words)
+
+
+@pytest.mark.parametrize("page", [p for p in PAGES if list(command_lines(p))], ids=lambda p: p.name)
+def test_inputs_are_made_by_an_earlier_line_of_the_page(page):
+    listed = USERS_OWN.get(page.relative_to(ROOT).as_posix())
+    made = {*re.findall(r"^mkdir (\S+)$", page.read_text(encoding="utf-8"), re.MULTILINE), listed}
+    for line in command_lines(page):
+        command, *words = shlex.split(line, comments=True)
+        values = COMMANDS[command].make_context(command, words).params
+        lists = [value if isinstance(value, list) else [value] for name, value in values.items() if name not in _OUTPUT]
+        read = [path for paths in lists for path in paths if isinstance(path, Path)]
+        assert {path.parts[0] for path in read} <= made, f"{page.name}: jaxphoto {line}"
+        made |= {str(values[name]) for name in _OUTPUT & values.keys()}
+        if command == "example":
+            made |= {values["name"], f"{values['name']}.toml"}
 
 
 @pytest.mark.slow

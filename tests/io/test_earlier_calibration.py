@@ -55,7 +55,7 @@ def with_camera(years, name, table):
 
 def test_the_prior_adds_its_information(years, results):
     """(Q1^-1 + Q2^-1)^-1 and the weighted mean, whatever way the calibration is named."""
-    folder = with_camera(years, "named", '[cameras.one]\ncalibration = "../results"\nresiduals = "model"')
+    folder = with_camera(years, "named", '[cameras.one]\ncalibration = "../results"\nresiduals = "measured"')
     block = read_block(folder)
     alone, both = adjust(read_block(years / "this")), adjust(block)
     earlier = read_camera_file(results)

@@ -75,10 +75,10 @@ def test_times_are_written_as_the_file_had_them(write_folder, tmp_path, later):
 
 
 def test_round_trip_of_smac_keeps_what_is_static(write_folder, tmp_path):
-    measured = ("block.toml", 'distortion = "smac"', 'residuals = "measured"\ndistortion = "smac"')
-    write_block(read_block(write_folder(SMAC, R0, measured)), tmp_path / "copy")
+    corrected = ("block.toml", 'distortion = "smac"', 'residuals = "model"\ndistortion = "smac"')
+    write_block(read_block(write_folder(SMAC, R0, corrected)), tmp_path / "copy")
     interior = read_block(tmp_path / "copy").start.unknowns.interior["kodak"]
-    assert interior.residuals == "measured"
+    assert interior.residuals == "model"
     distortion = interior.distortion
     assert isinstance(distortion, Smac)
     assert (distortion.sign, float(distortion.r0), float(distortion.p3)) == ("add", 1.5, 1e-7)

@@ -3,21 +3,10 @@
 import cv2
 import numpy as np
 
-from jaxphoto.camera import Sensor
+from jaxphoto.extras.photos.rendered_photographs import GROUND_M, SENSOR
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 
-SENSOR = Sensor(640, 480, 0.006)
 C_MM = 3.6
-# Of the ground in the picture of it: a pixel, in m; at a height of 60 m a pixel of the sensor is 0.1 m.
-GROUND_M = 0.05
-
-
-def texture(rng, size):
-    """Blotches of many sizes, grey values 0 to 255."""
-    sum_ = np.zeros((size, size))
-    for width in (3, 4, 8, 16, 32):
-        sum_ += width * cv2.GaussianBlur(rng.normal(size=(size, size)), (0, 0), width)
-    return (sum_ - sum_.min()) / np.ptp(sum_) * 255
 
 
 def plane_to_pixel(position, angles_deg):

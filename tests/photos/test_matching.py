@@ -10,10 +10,11 @@ import pytest
 from jaxphoto.errors import InputError
 from jaxphoto.extras.photos.features import FEATURES, OF_FEW
 from jaxphoto.extras.photos.matching import match_photographs, nearest_pairs, photograph_pairs
+from jaxphoto.extras.photos.rendered_photographs import SENSOR, ground_texture
 from jaxphoto.georeferencing.recorded_positions import Gps
 from jaxphoto.initial.matches import PairMatches, connected_images
 from jaxphoto.io.photographs import photographs, sensor_and_interior
-from tests.photos.ground import C_MM, SENSOR, mapped, photograph, texture
+from tests.photos.ground import C_MM, mapped, photograph
 
 pytest.importorskip("pycolmap", reason="pycolmap, which matches photographs, is not installed (extra photos)")
 
@@ -29,7 +30,7 @@ STATIONS = [
 def taken(tmp_path_factory):
     """Photographs of the ground, the camera, their matrices, and the matches of all."""
     folder, rng = tmp_path_factory.mktemp("ground"), np.random.default_rng(1)
-    ground = texture(rng, 2400).astype(np.float32)
+    ground = ground_texture(rng, 2400).astype(np.float32)
     matrices = [photograph(folder / f"{k}.png", ground, *at, rng) for k, at in enumerate(STATIONS)]
     taken = photographs([folder / f"{k}.png" for k in range(len(STATIONS))])
     camera = sensor_and_interior(taken, SENSOR.pixel_mm, C_MM)
@@ -143,7 +144,7 @@ def test_connected_images():
 def elsewhere(tmp_path_factory):
     """Two photographs of other ground."""
     folder, rng = tmp_path_factory.mktemp("elsewhere"), np.random.default_rng(7)
-    ground = texture(rng, 2400).astype(np.float32)
+    ground = ground_texture(rng, 2400).astype(np.float32)
     for k, at in enumerate(STATIONS[:2]):
         photograph(folder / f"far{k}.png", ground, *at, rng)
     return [folder / "far0.png", folder / "far1.png"]

@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 
 from jaxphoto import ExteriorOrientation, InputError, InteriorOrientation, Sensor, Smac
+from jaxphoto.extras.photos.rendered_photographs import board_view
 from jaxphoto.extras.photos.targets import find_targets, read_board, rendered
 from jaxphoto.extras.photos.targets.circles import elliptic_blobs, fit_discs
 from jaxphoto.initial.rays import ideal_coordinates
@@ -22,18 +23,6 @@ BOARDS = (
 VIEWS = 3
 
 
-def view(board, k: int) -> ExteriorOrientation:
-    """A camera over the board, tilted by half a radian to one side or another, and turned about its axis."""
-    middle = board.xyz_m.mean(axis=0)
-    away = np.array([0.13 * np.cos(1.7 * k + 0.3), 0.13 * np.sin(1.7 * k + 0.3), 0.25])
-    z = away / np.linalg.norm(away)
-    x = np.cross([0.0, 1.0, 0.0], z)
-    x /= np.linalg.norm(x)
-    c, s = np.cos(0.35 * k + 0.2), np.sin(0.35 * k + 0.2)
-    turn = np.array([[c, s, 0], [-s, c, 0], [0, 0, 1]])
-    return ExteriorOrientation(middle + away, turn @ np.stack([x, np.cross(z, x), z]))  # type: ignore[arg-type]
-
-
 def truth_px(board, exterior, points) -> np.ndarray:
     """What is measured of targets without noise: corners, and centres of the ellipses that circles are seen as."""
     n = len(points)
@@ -49,7 +38,7 @@ def compared(pattern) -> tuple[np.ndarray, np.ndarray, int]:
     errors, sigmas, in_view = [], [], 0
     board = pattern.board
     for k in range(VIEWS):
-        exterior = view(board, k)
+        exterior = board_view(board, k)
         found = pattern.find(rendered(pattern, SENSOR, LENS, exterior, noise=4.0, seed=k))
         assert found is not None, k
         every = truth_px(board, exterior, np.arange(len(board.points)))
@@ -77,7 +66,7 @@ def test_errors_are_as_large_as_their_standard_deviations(description):
 
 def test_a_grid_of_circles_is_found_among_other_round_things():
     pattern = read_board("circles:4x9:spacing_mm=18:diameter_mm=15")
-    exterior = view(pattern.board, 1)
+    exterior = board_view(pattern.board, 1)
     picture = rendered(pattern, SENSOR, LENS, exterior, noise=3.0, rays=13)
     truth = truth_px(pattern.board, exterior, np.arange(36))
     rng, n = np.random.default_rng(0), 0
@@ -162,7 +151,7 @@ def test_a_wrong_description_is_one_sentence_with_the_syntax(description, words)
 
 def test_no_board_anywhere_suggests_the_other_count(tmp_path):
     pattern = read_board("chessboard:8x5:square_mm=22")
-    cv2.imwrite(str(tmp_path / "a.png"), rendered(pattern, SENSOR, LENS, view(pattern.board, 0), rays=4))
+    cv2.imwrite(str(tmp_path / "a.png"), rendered(pattern, SENSOR, LENS, board_view(pattern.board, 0), rays=4))
     taken = photographs([tmp_path / "a.png"])
     with pytest.raises(InputError, match="8x5 corners found"):
         find_targets(taken, read_board("chessboard:9x6:square_mm=22"))
@@ -171,7 +160,7 @@ def test_no_board_anywhere_suggests_the_other_count(tmp_path):
 def test_the_board_is_seen_from_its_front():
     """Z of the board points to the camera, whichever corner OpenCV begins with."""
     pattern = read_board("chessboard:8x5:square_mm=22")
-    found = pattern.find(rendered(pattern, SENSOR, LENS, view(pattern.board, 1), rays=4))
+    found = pattern.find(rendered(pattern, SENSOR, LENS, board_view(pattern.board, 1), rays=4))
     first, along, down = found.places.column_row[[0, 7, 32]]
     (a, b), (c, d) = along - first, down - first
     assert a * d - b * c > 0  # columns to the right, rows downwards, clockwise in a picture whose rows run down

@@ -159,9 +159,11 @@ def _typical_of_camera(
     interior_at: Callable[[Array], InteriorOrientation], at: Float[Array, "n"], sigma: Array, corner: Float[Array, "2"]
 ) -> Float[Array, "n"]:
     """Return the change of each camera parameter that moves the image of a point by `sigma` (mm); 1 if none does."""
-    # Use a point near the axis (moved by c), and measured coordinates in the corner (moved by the coefficients).
+    # Use a point near the axis (moved by c), and measured coordinates in the corner (moved by the coefficients). They
+    # are far apart, so their difference must not be scaled by the distortion.
     aim, centre = jnp.array([0.1, 0.1, -1.0]), ExteriorOrientation(jnp.zeros(3), jnp.eye(3))
-    by_number = jax.jacfwd(lambda p: image_residual(interior_at(p), centre, aim, corner))(at)
+    camera_at = lambda p: dataclasses.replace(interior_at(p), residuals="model")  # noqa: E731
+    by_number = jax.jacfwd(lambda p: image_residual(camera_at(p), centre, aim, corner))(at)
     typical = sigma / jnp.maximum(jnp.max(jnp.abs(by_number), axis=0), 1e-30)
     return jnp.where(jnp.isfinite(typical), typical, 1.0)
 

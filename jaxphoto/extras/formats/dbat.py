@@ -5,7 +5,8 @@ from pixel (0, 0). It *adds* K, P and the aspect `as` to the measured coordinate
 all of them change sign. Model 3 applies 1 + as and the skew before the polynomial: `affine_brown` with b1 = -as;
 <aspect> is 1 - as. Models 1 and 2 have neither aspect nor skew. Model 4 applies both after the polynomial:
 `brown_affine`. Model 5 applies 1 + as before the principal point is subtracted, which divides px by it, and the skew
-after the polynomial: `stretched_brown`. Source: DBAT, github.com/niclasborlin/dbat.
+after the polynomial: `stretched_brown`. Its residuals are those of the corrected coordinates: `residuals = "model"`.
+Source: DBAT, github.com/niclasborlin/dbat.
 
 PhotoModeler's text export, optionally with DBAT's control files in the same folder.
 
@@ -289,8 +290,8 @@ def _camera(script: _Script) -> dict[str, Any]:
     if model == "5" and interior["xp_mm"] != 0:
         interior["xp_mm"] = (interior["xp_mm"] + middle[0]) / (1.0 - interior["b1"]) - middle[0]
     return {
-        "width_px": width, "height_px": height, "pixel_mm": pixel, "distortion": distortion, "interior": interior,
-        "unknowns": unknowns,
+        "width_px": width, "height_px": height, "pixel_mm": pixel, "distortion": distortion,
+        "residuals": "model", "interior": interior, "unknowns": unknowns,
     }  # fmt: skip
 
 
@@ -406,7 +407,8 @@ def _export_camera(path: Path, lines: list[str]) -> dict[str, Any]:
     interior |= dict(zip(("k1", "k2", "k3", "p1", "p2"), (0.0 - value for value in coefficients), strict=True))
     return {
         "width_px": int(width), "height_px": int(height), "pixel_mm": pixel,
-        "distortion": "brown" if square else "affine_brown", "interior": interior | ({} if square else {"b1": b1}),
+        "distortion": "brown" if square else "affine_brown", "residuals": "model",
+        "interior": interior | ({} if square else {"b1": b1}),
     }  # fmt: skip
 
 

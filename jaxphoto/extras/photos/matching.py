@@ -320,7 +320,11 @@ def _over_sigma(off_line_px: float, one: np.ndarray, other: np.ndarray, *sigmas:
     `sigmas`.
     """
     # Sample with the weights of MAGSAC++ (Barath and others, 2020) from OpenCV's fixed seed.
-    matrix, _ = cv2.findFundamentalMat(one, other, cv2.USAC_MAGSAC, off_line_px, 0.9999, 10_000)
+    try:
+        matrix, _ = cv2.findFundamentalMat(one, other, cv2.USAC_MAGSAC, off_line_px, 0.9999, 10_000)
+    except cv2.error:
+        # OpenCV 5.0 fails an assertion where its local optimisation finds no matrix for few matches.
+        matrix = None
     if matrix is None:
         return np.zeros(0)
     one, other = (np.column_stack([xy, np.ones(len(xy))]) for xy in (one, other))

@@ -64,7 +64,7 @@ class CameraKeys(SensorKeys):
 
     distortion: StrictStr
     projection: StrictStr = Perspective.name
-    residuals: Literal["model", "measured"] = "model"
+    residuals: Literal["model", "measured"] = "measured"
     interior: dict[str, Number] = {}  # noqa: RUF012
     unknowns: dict[str, Any] = {}  # noqa: RUF012
     known: CovarianceKeys | None = None
@@ -190,7 +190,7 @@ def camera_section(camera: Camera) -> dict[str, Any]:
     """Return the [cameras.X] table from which `read_camera` restores `camera`."""
     sensor, interior, priors, known, reservation = camera
     written: dict[str, Any] = sensor_keys(sensor) | model_keys(interior)
-    if interior.residuals != "model":
+    if interior.residuals != "measured":
         written["residuals"] = interior.residuals
     names = parameter_names(interior)
     written["interior"] = {n: float(get_parameter(interior, n)) for n in (*names, *constant_names(interior))}

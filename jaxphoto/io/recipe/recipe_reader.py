@@ -86,9 +86,8 @@ def recipe_from(values: Mapping[str, Any], file: str = "recipe.toml") -> Recipe:
     """
     top = Section(file, "", dict(values))
     keys = top.model(RecipeKeys)
-    # Read the tables of block.toml. Residuals default to "measured": noise is added to measured coordinates.
+    # Read the tables of block.toml.
     stated = {name: _without_truth(getattr(keys, name)) for name in ("cameras", "mounts", "strips")}
-    stated["cameras"] = {name: {"residuals": "measured"} | camera for name, camera in stated["cameras"].items()}
     settings = read_settings(stated | {key: top.values[key] for key in ("title", "datum") if key in top}, file)
     cameras = {
         name: _camera(settings.top.section("cameras").section(name), top.section("cameras").section(name), camera)

@@ -284,7 +284,6 @@ def calibrate(
     interior = nearest_distortion(rough, distortion_model(model, sensor), names, sensor)
     if isinstance(distortion, Smac) and r0_mm:
         interior = rebalance(interior, r0_mm)
-    interior = dataclasses.replace(interior, residuals="measured")
 
     added: float | None = None
     correction, removed = np.zeros_like(rows.xy_mm), []

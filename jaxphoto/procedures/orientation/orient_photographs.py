@@ -466,7 +466,7 @@ def photographs_block(
     rows: ImagePoints,
 ) -> Block:
     """Build a free network of photographs of one `camera` (interior orientation, priors), initial values `start`."""
-    interior, priors = (dataclasses.replace(part, residuals="measured") for part in camera)
+    interior, priors = camera
     unknowns = Unknowns({CAMERA: interior}, *start, {}, {})
     n, n_points = len(names), len(points)
     return Block(
