@@ -227,7 +227,7 @@ def mountings(block: Block, unknowns: Unknowns) -> tuple[Mount, StripBias]:
 
     The direction of the camera's x axis is part of `exposures`: stacking requires mounts of one class.
     """
-    none = jnp.zeros(3)
+    none = jax.device_put(np.zeros(3))
     mounts = {name: Mount(m.lever_arm, m.boresight, m.time_offset) for name, m in unknowns.mounts.items()}
     return (
         _by_name(mounts, block.image_mount, Mount(none, none)),

@@ -223,7 +223,7 @@ def check_rank(adjusted: Adjustment) -> None:
     """Raise RankError if the normal matrix at the optimum is singular, with the undetermined unknowns and the cure."""
     if adjusted.factored is None or not bool(adjusted.converged):
         return
-    if adjusted.equations.least_pivot() > DEFECT:
+    if np.asarray(adjusted.equations.pivots()).min() > DEFECT:
         return
     from jaxphoto.adjustment.weakness_messages import weaknesses_of
 

@@ -150,7 +150,7 @@ class _State:
         if start.image_known.all() and start.point_known.all():
             return start
         places = lambda u: (u.exterior.position, u.exterior.camera_from_object, u.points)  # noqa: E731
-        values = (jnp.asarray(self.positions), jnp.asarray(self.matrices), jnp.asarray(self.points))
+        values = jax.device_put((self.positions, self.matrices, self.points))
         return Start(eqx.tree_at(places, start.unknowns, values), self.image_known, self.point_known)
 
     def check(self) -> None:

@@ -50,7 +50,7 @@ def distortion_curve(
     half = np.array([sensor.width_mm, sensor.height_mm]) / 2
     radius = float(np.hypot(*(half - np.abs(np.asarray(interior.principal_point)))))
     r = np.linspace(0.0, radius, _STEPS)
-    (radial, other), jacobian = call_compiled(_curve, as_arrays(interior), jnp.asarray(r))
+    (radial, other), jacobian = call_compiled(_curve, as_arrays(interior), r)
     sigma = None
     if covariance is not None:
         jacobian = np.asarray(jacobian)

@@ -104,7 +104,7 @@ def _format(interior: InteriorOrientation, sensor: Sensor) -> Float[np.ndarray, 
     side = np.arange(_SIDE) / _SIDE * 2 - 1
     ones = np.ones(_SIDE)
     edge = np.concatenate([np.stack(v, axis=1) for v in ((side, -ones), (ones, side), (-side, ones), (-ones, -side))])
-    corners = jnp.asarray(edge * [sensor.width_mm / 2, sensor.height_mm / 2])
+    corners = edge * [sensor.width_mm / 2, sensor.height_mm / 2]
     return np.asarray(call_compiled(_tangents, as_arrays(interior), corners))
 
 

@@ -92,7 +92,7 @@ def _sigma_map(
     interior, sensor = adjusted.unknowns.interior[name], adjusted.block.sensors[name]
     xy = _cells(sensor) if points is None else np.asarray(points, float)
     parameters, covariance = joint
-    jacobian = to_numpy(call_compiled(_derivatives, as_arrays(interior), jnp.asarray(xy), jnp.asarray(1 / distance_m)))
+    jacobian = to_numpy(call_compiled(_derivatives, as_arrays(interior), xy, np.asarray(1 / distance_m)))
     index = [
         *(parameter_names(interior).index(p) for p in parameters),
         *range(jacobian.shape[2] - 6, jacobian.shape[2]),
