@@ -166,8 +166,11 @@ _SIGMAS = ("sd", "predicted_sigma", "worst_px")
 # A number as text.
 _NUMBER = re.compile(r"[-+]?\d[\d.]*(e[-+]?\d+)?")
 # Columns of parameters and their paths; columns of a table that replace the units of parameters.
-_PATHS, _PATH = ("parameter", "estimate", "parameter_a", "parameter_b", "with"), re.compile(r".+\]\.\w+$|[a-z_]+\.\w+$")
-_HAS_UNIT = {"unit", "rho", "estimate_unit"}
+_PATHS, _PATH = (
+    ("parameter", "interior", "estimate", "parameter_a", "parameter_b", "with"),
+    re.compile(r".+\]\.\w+$|[a-z_]+\.\w+$"),
+)
+_HAS_UNIT = {"unit", "rho", "estimate_unit", "mean_abs_rho", "max_abs_rho"}
 # Number of significant digits of values without a standard deviation, by name without unit.
 _DIGITS = {
     "w": 3, "w_X": 3, "w_Y": 3, "w_Z": 3, "detectable": 3, "share": 2, "ratio": 3, "rmse": 3, "rms": 3, "fit": 3,

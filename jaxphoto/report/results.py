@@ -50,7 +50,6 @@ from jaxphoto.report.tables import (
     Tables,
     check_spread,
     recovery_spread,
-    shown_interior,
     side_by_side,
     with_correlated_sigma,
 )
@@ -107,7 +106,8 @@ def write_results(
             # Return memory to the system: a table of millions of rows leaves hundreds of MB.
             return_freed_memory()
         if with_page:
-            (work / "report.html").write_text(report_page(tables, verdict, record, seconds), encoding="utf-8")
+            factor = float(entries.get("sigma_factor", 1.0))
+            (work / "report.html").write_text(report_page(tables, verdict, record, seconds, factor), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
         write_summary(summary | dict(entries), work)
 
@@ -215,8 +215,12 @@ def report_page(
     verdict: Verdict,
     record: CommandRecord | None = None,
     seconds: Mapping[str, float] = MappingProxyType({}),
+    factor: float = 1.0,
 ) -> str:
-    """Return the report as HTML: verdict, at most three findings, summary with times (`seconds`), then all sections."""
+    """Return the report as HTML: verdict, at most three findings, summary with times (`seconds`), then all sections.
+
+    `factor`: factor of the standard deviations of the camera for correlated residuals.
+    """
     block = tables.adjusted.block
     summary = summary_table(tables)
     if seconds:
@@ -228,7 +232,7 @@ def report_page(
         fact = [text.removesuffix(f". {hint}") for text, hint in zip(table["text"], table["hint"], strict=True)]
         columns = ["severity", "code", "value", "limit", "finding", "hint"]
         parts += [Heading("Further findings"), without_empty(table.assign(finding=fact)[columns])]
-    parts += adjustment_sections(tables)
+    parts += adjustment_sections(tables, factor=factor)
     if record:
         parts += provenance(record)
         if block.converted_from:
@@ -367,7 +371,7 @@ def interior_table(tables: Tables, start: InteriorOrientation | None = None, fac
 
     `factor`: factor of the standard deviations for correlated residuals (`with_correlated_sigma`).
     """
-    table = with_correlated_sigma(shown_interior(tables), tables.adjusted, factor)
+    table = with_correlated_sigma(tables.interior, tables.adjusted, factor)
     rows = []
     for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
         name, pixel, sigma = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma_correlated"]
@@ -464,7 +468,7 @@ def _residuals(tables: Tables, cameras: Sequence[str]) -> Iterator[Part]:
     yield Paragraph(
         "Largest normalised residuals. r is the redundancy number. Internal reliability: MDB, the minimal detectable "
         "bias (power 80 %), in the unit of the row. External reliability: the effect of an undetected bias of one "
-        "MDB on c, x_p, y_p and the most affected estimate, in its standard deviations."
+        "MDB on c, x_p, y_p and the most affected estimate, in its standard deviation (both a priori)."
     )
     yield readable(largest).rename(columns=_RELIABILITY)
 

@@ -165,7 +165,9 @@ class Tables:
         for camera, interior in self.adjusted.unknowns.interior.items():
             for name in (*parameter_names(interior), *constant_names(interior)):
                 test = tests.get((camera, name))
-                tested = (test.sigma, test.significant) if test else (np.nan, None)
+                # A test against zero means nothing for c.
+                significant = test.significant if test and name != "c_mm" else None
+                tested = (test.sigma if test else np.nan, significant)
                 value = float(get_parameter(interior, name))
                 rows.append((camera, name, value, *tested, parameter_unit(interior, name)))
         return pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma", "significant", "unit"])
@@ -480,12 +482,6 @@ def initial_values(start: Unknowns) -> dict[str, float]:
                 factor = 180 / np.pi if path.endswith(("_rad", "_rad_per_s")) else 1.0
                 values[path.replace("_rad", "_deg")] = factor * float(value)
     return values
-
-
-def shown_interior(tables: Tables) -> pd.DataFrame:
-    """Return `Tables.interior` for display: no significance of c, which is a difference from zero."""
-    table = tables.interior
-    return table.assign(significant=table["significant"].where(table["parameter"] != "c_mm", None))
 
 
 def check_spread(check: pd.DataFrame) -> pd.DataFrame:

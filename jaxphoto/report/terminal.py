@@ -9,7 +9,7 @@ from jaxphoto.errors import counted, printable
 from jaxphoto.report.findings import MARKS, Verdict
 from jaxphoto.report.formatting import to_rich
 from jaxphoto.report.residual_findings import component_tables
-from jaxphoto.report.tables import Tables, check_spread, recovery_spread, shown_interior
+from jaxphoto.report.tables import Tables, check_spread, recovery_spread
 from jaxphoto.statistics import VarianceComponents
 
 # Maximum numbers of findings, of notes, and of parameters of mounts and strips.
@@ -47,7 +47,7 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
     console.print(f"{adjusted.outcome.value} ({int(adjusted.steps)} iterations)")
     print_sigma0(adjusted, console)
     shown = {
-        "interior orientation (a posteriori)": shown_interior(tables)[tables.interior["sigma"].notna()],
+        "interior orientation (a posteriori)": tables.interior[tables.interior["sigma"].notna()],
         "mounts and strips (a posteriori)": tables.georeferencing.head(_PARAMETERS),
         "residuals": tables.residual_spread.drop(columns="mean"),
         "check points": check_spread(tables.check_points) if len(tables.check_points) else tables.check_points,
