@@ -29,9 +29,9 @@ _LEGEND = (
     "Yellow: no tolerance, ours over printed beyond 2 or below 1/2. No colour: no tolerance."
 )
 _WITHOUT_TOLERANCE, _NOT_COMPUTED = "no tolerance is published", "not computed"
-# Ratio of a computed and a published value without tolerance beyond which the page marks it; signed columns have none.
 # Beginning of columns with the value that the standard deviations of ours predict.
 _EXPECTED = "expected_"
+# Ratio of a computed and a published value without tolerance beyond which the page marks it; signed columns have none.
 _FAR, _SIGNED = 2.0, r"mean_(?!abs)"
 _STYLE = ".far { background: var(--amber); padding: 0 .3em }"
 _CELL = Markup('<span class="{}">{}{}</span><br>{}')
