@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto.arrays import namespace
+from jaxphoto.arrays import is_traced, namespace
 from jaxphoto.camera import (
     AbstractDistortion,
     InteriorOrientation,
@@ -73,10 +73,14 @@ class BlockEdits(eqx.Module):
         """Return a copy with a new distortion of `camera`: `block.with_distortion("kodak", Smac(), free=("k1", "k2"))`.
 
         `free` names the estimated coefficients; the others are FIXED, and c_mm, xp_mm and yp_mm retain their priors.
-        Raises InputError as `with_camera` does.
+        Raises InputError as `with_camera` does, and for a distortion without derivative on the optical axis.
         """
         block: Any = self
         name = one_camera(block, camera)
+        if not isinstance(distortion, AbstractDistortion):
+            raise InputError(f"distortion: {distortion!r}; give a model with its coefficients, such as Brown()")
+        if not is_traced(distortion):
+            distortion.check()
         interior = dataclasses.replace(block.start.unknowns.interior[name], distortion=distortion)
         others = set(parameter_names(interior)) - set(distortion.coefficients)
         return with_interior(

@@ -22,6 +22,8 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """
 COLOURS: dict[Severity, str] = {"error": "red", "warning": "amber", "note": "green"}
 MARKS: dict[Severity, str] = {"error": "!!", "warning": "!", "note": "-"}
+# Findings before others of their severity.
+_FIRST = ("common_bias", "external_reliability")
 _DECLARED: dict[str, dict[str, str]] = tomllib.loads(
     (files("jaxphoto.report") / "templates" / "findings.toml").read_text(encoding="utf-8")
 )
@@ -60,14 +62,14 @@ class Finding:
 
 @dataclasses.dataclass(frozen=True, repr=False)
 class Verdict:
-    """All findings by decreasing severity; within a severity in the order of the tests."""
+    """All findings by decreasing severity; within a severity by importance and in the order of the tests."""
 
     findings: tuple[Finding, ...]
 
     @classmethod
     def of(cls, findings: Iterable[Finding]) -> "Verdict":
-        """Sort findings by severity."""
-        return cls(tuple(sorted(findings, key=lambda f: SEVERITIES.index(f.severity))))
+        """Sort findings by severity; first those that say how far errors may move the camera."""
+        return cls(tuple(sorted(findings, key=lambda f: (SEVERITIES.index(f.severity), f.code not in _FIRST))))
 
     def __repr__(self) -> str:
         return "\n".join([self.headline, *(f"{MARKS[f.severity]} {f.text}" for f in self.findings)])

@@ -237,7 +237,7 @@ def _svg(plot: Plot) -> Markup:
 def _arrange(figure: Figure) -> None:
     """Set the margins of a panel: fixed, unless names of any length are along an axis.
 
-    Constrained layout takes as long as drawing.
+    Fitting the margins takes as long as drawing.
     """
     from matplotlib.ticker import AutoLocator, FixedLocator
 
@@ -245,7 +245,7 @@ def _arrange(figure: Figure) -> None:
     for axis in (first.xaxis, first.yaxis):
         locator = axis.get_major_locator()
         if isinstance(locator, FixedLocator):
-            figure.set_layout_engine("constrained")
+            figure.set_layout_engine("tight")
             return
         if isinstance(locator, AutoLocator):
             locator.set_params(nbins=_TICKS)

@@ -230,8 +230,9 @@ def report_page(
     if len(verdict.findings) > _TOP:
         table = verdict.table.iloc[_TOP:]
         fact = [text.removesuffix(f". {hint}") for text, hint in zip(table["text"], table["hint"], strict=True)]
-        columns = ["severity", "code", "value", "limit", "finding", "hint"]
-        parts += [Heading("Further findings"), without_empty(table.assign(finding=fact)[columns])]
+        units = [f.numbers.get("unit", "") for f in verdict.findings[_TOP:]]
+        columns = ["severity", "code", "value", "limit", "unit", "finding", "hint"]
+        parts += [Heading("Further findings"), without_empty(table.assign(finding=fact, unit=units)[columns])]
     parts += adjustment_sections(tables, factor=factor)
     if record:
         parts += provenance(record)

@@ -86,10 +86,10 @@ class Tables:
     @cached_property
     def coverage(self) -> Coverage | None:
         """Coverage of the ground; None without scale, or unless the images are near-vertical."""
-        if self.unit != "m" or not len(self.adjusted.structure.image):
+        down = np.asarray(self.adjusted.unknowns.exterior.camera_from_object)[:, 2, 2]
+        if self.unit != "m" or not len(self.adjusted.structure.image) or np.median(down) <= _NEAR_VERTICAL:
             return None
-        cover, down = coverage(self.adjusted), np.asarray(self.adjusted.unknowns.exterior.camera_from_object)[:, 2, 2]
-        return cover if np.median(down) > _NEAR_VERTICAL else None
+        return coverage(self.adjusted)
 
     @cached_property
     def redundancy(self) -> statistics.Redundancy:
@@ -564,6 +564,6 @@ def recovery_spread(recovery: pd.DataFrame) -> pd.DataFrame:
     columns = {
         "n": grouped.size(),
         "rms_ratio": np.sqrt(grouped.apply(lambda r: float(np.mean(np.square(r))))),
-        "beyond_2_sigma": grouped.apply(lambda r: float(np.mean(np.abs(r) > 2))),
+        "beyond_2_sigma": grouped.apply(lambda r: f"{100 * np.mean(np.abs(r) > 2):.1f} %"),
     }
     return pd.DataFrame(columns).reset_index(names="group")

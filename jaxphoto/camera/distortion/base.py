@@ -8,15 +8,17 @@ direction. Direction, sign and units of a distortion are therefore part of its t
 
 import abc
 from collections.abc import Mapping
-from typing import ClassVar, Literal, NamedTuple
+from typing import ClassVar, Literal, NamedTuple, get_args
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxphoto.camera.declared import Declared
 from jaxphoto.camera.sensor import Sensor
+from jaxphoto.errors import InputError
 from jaxphoto.short_repr import pretty_repr
 
 # Maximum number of Newton iterations; 4 to 8 suffice within the monotone range.
@@ -43,6 +45,7 @@ def radial_powers(letter: str, n: int) -> dict[str, int]:
     return {f"{letter}{i}": -2 * i for i in range(1, n + 1)}
 
 
+_Domain = Literal["measured", "ideal"]
 Affinity = Literal["added", "before", "after", "around"]
 
 
@@ -64,12 +67,17 @@ class AbstractDistortion(Declared):
     applied separately "before" or "after" them; or one part before and one after ("around").
     """
 
-    domain: eqx.AbstractClassVar[Literal["measured", "ideal"]]
+    domain: eqx.AbstractClassVar[_Domain]
     rare: ClassVar[tuple[str, ...]] = ()
     scales: ClassVar[tuple[str, ...]] = ()
     normalised: ClassVar[bool] = False
     terms: ClassVar[Mapping[str, Term] | None] = None
     affinity: ClassVar[Affinity] = "after"
+
+    def __init_subclass__(cls, **options) -> None:
+        super().__init_subclass__(**options)
+        if "domain" in cls.__dict__ and cls.domain not in get_args(_Domain):
+            raise InputError(f'{cls.__qualname__}: domain {cls.domain!r}; use "measured" or "ideal"')
 
     @classmethod
     def plain(cls, sensor: Sensor) -> "AbstractDistortion":
@@ -85,6 +93,18 @@ class AbstractDistortion(Declared):
     def usual(cls) -> tuple[str, ...]:
         """Return the commonly needed coefficients: all except `rare` and `scales`."""
         return tuple(name for name in cls.coefficients if name not in (*cls.rare, *cls.scales))
+
+    def check(self) -> None:
+        """Raise InputError if `closed_form` does not map a coordinate to one, with a derivative on the optical axis."""
+        axis = jnp.zeros(2)
+        shape = jax.eval_shape(self.closed_form, axis).shape
+        if shape != (2,):
+            raise InputError(f"{type(self).__qualname__}.closed_form returns the shape {shape}; it must be (2,)")
+        if not np.isfinite(jax.jit(jax.jacfwd(self.closed_form))(axis)).all():
+            raise InputError(
+                f"{type(self).__qualname__}.closed_form has no derivative at (0, 0): replace the square root of "
+                "x^2 + y^2 by powers of r^2"
+            )
 
     @abc.abstractmethod
     def closed_form(self, xy: Float[Array, "2"]) -> Float[Array, "2"]:
