@@ -11,7 +11,7 @@ from jaxphoto.camera.sensor import Sensor
 _FEW, _PERCENTILES = 20, (1.0, 99.0)
 # Maximum distance of the middle of the image points from that of the format, as a fraction of its sides. Points of all
 # images of a camera, taken together, are in the middle of the format to a few per cent.
-_OFF_CENTRE = 0.1
+_OFF_CENTRE = 0.12
 # Maximum part of the format beyond its border: distortion and measurements next to the border.
 _BEYOND = 0.02
 # Resized pictures: maximum relative difference of the factors of both axes; maximum distance of the first points from

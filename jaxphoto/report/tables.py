@@ -28,7 +28,7 @@ from jaxphoto.tracing import refuse_traced
 from jaxphoto.unknowns import Unknowns, Weighted
 
 # Median cosine of the tilt above which images are near-vertical (45 degrees).
-_NEAR_VERTICAL = 0.7
+NEAR_VERTICAL = 0.7
 
 
 class Tables:
@@ -89,7 +89,7 @@ class Tables:
         if self.unit != "m" or not len(self.adjusted.structure.image):
             return None
         cover, down = coverage(self.adjusted), np.asarray(self.adjusted.unknowns.exterior.camera_from_object)[:, 2, 2]
-        return cover if np.median(down) > _NEAR_VERTICAL else None
+        return cover if np.median(down) > NEAR_VERTICAL else None
 
     @cached_property
     def redundancy(self) -> statistics.Redundancy:

@@ -19,7 +19,7 @@ from jaxphoto.procedures.adjust import left_out_words
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
 from jaxphoto.report.formatting import of_sigma, plus_minus, symbol
 from jaxphoto.report.residual_findings import NOTHING_FITS, reliability_findings, residual_findings, stretch_findings
-from jaxphoto.report.tables import Tables
+from jaxphoto.report.tables import NEAR_VERTICAL, Tables
 from jaxphoto.statistics import (
     SIGNIFICANCE_LEVEL,
     CameraDifferences,
@@ -81,6 +81,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     if adjusted.left_out:
         yield Finding("rejected", "warning", left_out_words(adjusted))
     yield from behind_findings(adjusted)
+    yield from looking_up_findings(tables)
     yield from format_findings(adjusted)
     yield from residual_findings(tables)
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
@@ -125,6 +126,23 @@ def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
     if len(behind):
         names = [f"{block.points[rows.point[k]]} in {block.images[rows.image[k]]}" for k in behind]
         yield Finding("points_behind", "warning", few(names), len(names))
+
+
+def looking_up_findings(tables: Tables) -> Iterator[Finding]:
+    """Yield a finding if all images are below their object points and look up.
+
+    Control or stations with exchanged axes, or one axis of the wrong sign, are mirrored. On flat ground a mirrored plan
+    is that of a block turned by half a turn about a horizontal axis, which fits as well.
+    """
+    adjusted, s = tables.adjusted, tables.adjusted.structure
+    if tables.unit != "m" or not len(s.image):
+        return
+    exterior, z = adjusted.unknowns.exterior, np.asarray(adjusted.unknowns.points)[s.point, 2]
+    depth = z - np.asarray(exterior.position)[s.image, 2]
+    upwards = -np.asarray(exterior.camera_from_object)[s.image, 2, 2]
+    if depth.min() > 0 and np.median(upwards) > NEAR_VERTICAL:
+        severity: Severity = "error" if adjusted.block.frame.kind == "epsg" else "warning"
+        yield Finding("looking_up", severity, value=float(np.median(depth)))
 
 
 def format_findings(adjusted: Adjustment) -> Iterator[Finding]:
