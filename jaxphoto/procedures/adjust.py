@@ -14,7 +14,7 @@ from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.arrays import is_traced
 from jaxphoto.block import Block, sensor_rows
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.errors import BlockError, DatumError, RankError, few
+from jaxphoto.errors import BlockError, DatumError, RankError, camera_words, few
 from jaxphoto.initial.approximate import PointsBehind, approximate, completed, intersected
 from jaxphoto.initial.rays import camera_rays, turn_to_object
 from jaxphoto.observations import AbstractObservations, KnownParameters
@@ -87,6 +87,7 @@ def adjust_for_tables(
     `seconds["start"]` of the result includes the search for approximate values.
     """
     from jaxphoto.statistics import prepare_statistics
+    from jaxphoto.statistics.block_geometry import size_mismatches
 
     spent, began = {"start": 0.0}, time.perf_counter()
 
@@ -99,7 +100,12 @@ def adjust_for_tables(
         began = time.perf_counter()
         return done
 
-    adjusted = _adjust_from_best_start(block, block.priors, from_start, max_steps, report=report)
+    try:
+        adjusted = _adjust_from_best_start(block, block.priors, from_start, max_steps, report=report)
+    except BlockError as error:
+        for camera, mismatch in size_mismatches(block).items():
+            error.add_note(f"{camera_words(camera)}: {mismatch.text}")
+        raise
     adjusted.seconds.update(spent)
     return adjusted
 

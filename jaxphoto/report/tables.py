@@ -28,7 +28,7 @@ from jaxphoto.tracing import refuse_traced
 from jaxphoto.unknowns import Unknowns, Weighted
 
 # Median cosine of the tilt above which images are near-vertical (45 degrees).
-_NEAR_VERTICAL = 0.7
+NEAR_VERTICAL = 0.7
 
 
 class Tables:
@@ -87,7 +87,7 @@ class Tables:
     def coverage(self) -> Coverage | None:
         """Coverage of the ground; None without scale, or unless the images are near-vertical."""
         down = np.asarray(self.adjusted.unknowns.exterior.camera_from_object)[:, 2, 2]
-        if self.unit != "m" or not len(self.adjusted.structure.image) or np.median(down) <= _NEAR_VERTICAL:
+        if self.unit != "m" or not len(self.adjusted.structure.image) or np.median(down) <= NEAR_VERTICAL:
             return None
         return coverage(self.adjusted)
 

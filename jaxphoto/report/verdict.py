@@ -19,7 +19,7 @@ from jaxphoto.procedures.adjust import left_out_words
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
 from jaxphoto.report.formatting import of_sigma, plus_minus, symbol
 from jaxphoto.report.residual_findings import NOTHING_FITS, reliability_findings, residual_findings, stretch_findings
-from jaxphoto.report.tables import Tables
+from jaxphoto.report.tables import NEAR_VERTICAL, Tables
 from jaxphoto.statistics import (
     SIGNIFICANCE_LEVEL,
     CameraDifferences,
@@ -32,6 +32,7 @@ from jaxphoto.statistics import (
     prepare_hat_matrix,
     strip_differences,
 )
+from jaxphoto.statistics.block_geometry import size_mismatches
 from jaxphoto.statistics.correlation import FORMS, high_pairs
 from jaxphoto.unknowns import FIXED, Weighted
 
@@ -59,6 +60,9 @@ _FOR_DISTORTION = "image points towards the corners, more overlap or cross strip
 # Rows of the correlations: horizontal position, height, tilts.
 _PLAN, _HEIGHT, _TILTS = slice(0, 2), slice(2, 3), slice(3, 5)
 _C, _POINT = ("c_mm",), ("xp_mm", "yp_mm")
+# Maximum offset of the principal point from the middle, as a fraction of the format: lenses reach one or two per cent.
+# Maximum ratio of the adjusted and the initial principal distance, which nominal focal lengths reach by a few per cent.
+_OFF_MIDDLE, _C_RATIO = 0.05, 1.25
 
 
 def verdict_of(tables: Tables) -> Verdict:
@@ -77,6 +81,8 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     if adjusted.left_out:
         yield Finding("rejected", "warning", left_out_words(adjusted))
     yield from behind_findings(adjusted)
+    yield from looking_up_findings(tables)
+    yield from format_findings(adjusted)
     yield from residual_findings(tables)
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))
@@ -120,6 +126,51 @@ def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:
     if len(behind):
         names = [f"{block.points[rows.point[k]]} in {block.images[rows.image[k]]}" for k in behind]
         yield Finding("points_behind", "warning", few(names), len(names))
+
+
+def looking_up_findings(tables: Tables) -> Iterator[Finding]:
+    """Yield a finding if all images are below their object points and look up.
+
+    Control or stations with exchanged axes, or one axis of the wrong sign, are mirrored. On flat ground a mirrored plan
+    is that of a block turned by half a turn about a horizontal axis, which fits as well.
+    """
+    adjusted, s = tables.adjusted, tables.adjusted.structure
+    if tables.unit != "m" or not len(s.image):
+        return
+    exterior, z = adjusted.unknowns.exterior, np.asarray(adjusted.unknowns.points)[s.point, 2]
+    depth = z - np.asarray(exterior.position)[s.image, 2]
+    upwards = -np.asarray(exterior.camera_from_object)[s.image, 2, 2]
+    if depth.min() > 0 and np.median(upwards) > NEAR_VERTICAL:
+        severity: Severity = "error" if adjusted.block.frame.kind == "epsg" else "warning"
+        yield Finding("looking_up", severity, value=float(np.median(depth)))
+
+
+def format_findings(adjusted: Adjustment) -> Iterator[Finding]:
+    """Yield cameras whose image points, principal point or principal distance do not fit their format."""
+    block = adjusted.block
+    for name, mismatch in size_mismatches(block).items():
+        yield Finding(
+            "picture_size", "error" if mismatch.resized else "warning", f"{camera_words(name)}: {mismatch.text}"
+        )
+    for name, sensor in block.sensors.items():
+        words = camera_words(name)
+        first, last = (u.interior[name] for u in (block.start.unknowns, adjusted.unknowns))
+        size_mm = np.array([sensor.width_mm, sensor.height_mm])
+        offset = np.abs([np.asarray(i.principal_point) / size_mm for i in (last, first)]).max(axis=1)
+        if offset[0] > _OFF_MIDDLE and offset[0] > 2 * offset[1]:
+            x, y = np.asarray(last.principal_point) / sensor.pixel_mm
+            yield Finding(
+                "principal_point_far",
+                "warning",
+                words,
+                offset[0],
+                _OFF_MIDDLE,
+                numbers={"x": x, "y": y, "percent": 100 * offset[0]},
+            )
+        ratio = float(last.c) / float(first.c)
+        if not 1 / _C_RATIO < ratio < _C_RATIO:
+            numbers = {"c": float(last.c), "initial": float(first.c)}
+            yield Finding("c_far", "warning", words, ratio, _C_RATIO, numbers=numbers)
 
 
 # Weak geometry ---------------------------------------------------------------------------------------------------

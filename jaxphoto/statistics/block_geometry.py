@@ -19,7 +19,9 @@ import scipy
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.adjustment import Adjustment
+from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, Sensor
+from jaxphoto.camera.picture_size import Mismatch, size_mismatch
 from jaxphoto.compiling import call_compiled
 from jaxphoto.stability import as_arrays
 
@@ -145,6 +147,16 @@ def format_coverage(adjusted: Adjustment, camera: str) -> FormatCoverage:
     order = np.argsort(image, kind="stable")
     parts = np.split(xy[order], np.flatnonzero(np.diff(image[order])) + 1) if len(xy) else []
     return FormatCoverage(_hull_area(xy) / area, np.array([_hull_area(part) / area for part in parts]))
+
+
+def size_mismatches(block: Block) -> dict[str, Mismatch]:
+    """Detect image points that do not fit the format of their camera, by camera (`size_mismatch`)."""
+    rows = block.image_points
+    camera = np.array(block.image_camera)[np.asarray(rows.image)]
+    found = {
+        name: size_mismatch(sensor, np.asarray(rows.xy).T[:, camera == name]) for name, sensor in block.sensors.items()
+    }
+    return {name: mismatch for name, mismatch in found.items() if mismatch}
 
 
 def _hull_area(xy: Float[np.ndarray, "n 2"]) -> float:
