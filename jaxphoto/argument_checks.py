@@ -13,6 +13,13 @@ from jaxtyping import Array, Float
 from jaxphoto.errors import InputError
 
 
+def require(value: Any, kind: type, cure: str) -> None:
+    """Raise InputError with the `cure` if `value` is not an instance of `kind`."""
+    if not isinstance(value, kind):
+        given = value.__name__ if isinstance(value, type) else f"a {type(value).__name__}"
+        raise InputError(f"{given} is no {kind.__name__}: {cure}")
+
+
 def single(name: str, values: Any, *shape: int | None) -> Float[Array, "..."]:
     """Convert `values` to an array of `shape`, in which None is any size.
 

@@ -8,6 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
+from jaxphoto.argument_checks import require
 from jaxphoto.arrays import is_traced, namespace
 from jaxphoto.camera import (
     AbstractDistortion,
@@ -77,8 +78,7 @@ class BlockEdits(eqx.Module):
         """
         block: Any = self
         name = one_camera(block, camera)
-        if not isinstance(distortion, AbstractDistortion):
-            raise InputError(f"distortion: {distortion!r}; give a model with its coefficients, such as Brown()")
+        require(distortion, AbstractDistortion, "give a model with its coefficients, such as jaxphoto.Brown()")
         if not is_traced(distortion):
             distortion.check()
         interior = dataclasses.replace(block.start.unknowns.interior[name], distortion=distortion)

@@ -22,6 +22,7 @@ from jaxphoto.adjustment.draw_gradients import Common, Varying, held_in, path_na
 from jaxphoto.adjustment.model.block_values import values_of, with_datum
 from jaxphoto.adjustment.model.numbers import UnknownArrays
 from jaxphoto.adjustment.row_lists import batch_size, row_lists
+from jaxphoto.argument_checks import require
 from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block, Start
 from jaxphoto.compiling import call_compiled
@@ -78,6 +79,8 @@ def monte_carlo(
     Raises InputError for less than one draw.
     """
     check_draws(draws)
+    if not callable(perturb):
+        raise InputError(f"{perturb!r} is no function of a key and a block; give one, such as jaxphoto.bias(block, ...)")
     return readjust(adjusted, DrawnChange(perturb, seed), np.arange(draws), exterior=exterior, points=points)
 
 
@@ -94,6 +97,9 @@ def readjust(
 
     `change(entry, block)` returns the block with other values, in the same form as `perturb` of `monte_carlo`.
     """
+    require(adjusted, Adjustment, "give the result of jaxphoto.adjust(block)")
+    if not callable(change):
+        raise InputError(f"{change!r} is no function of a block; give one, such as jaxphoto.bias(block, ...)")
     run = Readjustment(adjusted, change, entries, exterior=exterior, points=points)
     return join_draws(list(run.batches(entries)))
 

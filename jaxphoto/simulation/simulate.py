@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PRNGKeyArray
 
+from jaxphoto.argument_checks import require
 from jaxphoto.block import Block, Start, Temperatures, bent_cameras, exposures, mountings
 from jaxphoto.camera import InteriorOrientation
 from jaxphoto.cloud import Cloud
@@ -101,6 +102,7 @@ def simulate(recipe: Recipe, seed: int = 0) -> Simulation:
     Ground, flight, points and each kind of noise have independent random streams: changing a sigma only scales its own
     noise. Raises BlockError if points or images have too few rays.
     """
+    require(recipe, Recipe, "read a file by jaxphoto.read_recipe")
     terrain = recipe.settlement.settled(recipe.terrain.drawn(stream(seed, "terrain")), recipe.ground, seed)
     # Use the same positions for every seed: the flying height depends on the ground only.
     height = float(np.mean(terrain.height(recipe.ground.draw(stream(0, "ground"), _PLACES))))
