@@ -95,6 +95,11 @@ class Step(eqx.Module):
         """Description of the step."""
         return TITLES[self.number]
 
+    @property
+    def correlation(self) -> float:
+        """Largest correlation of the misalignment with the principal point, with its sign; 0 if either is fixed."""
+        return _with_principal_point(self.covariance)[0]
+
 
 class _SharedParameters(NamedTuple):
     """Shared unknowns of a step: label -> value and sigma, in metres, radians, millimetres."""
@@ -245,14 +250,18 @@ def _misalignment(adjusted: Adjustment, cov: Covariance, parameters: _SharedPara
         large = [name for name, (value, sigma) in angles.items() if abs(value) > SIGNIFICANT * sigma]
         judged = f"significant: {', '.join(large)}" if large else "not significant"
         messages.append(f"misalignment of mount {mount}: {judged}")
-    rho, a, b = _strongest(cov, lambda x: "].boresight_" in x, lambda x: x.endswith(("].xp_mm", "].yp_mm")))
+    rho, a, b = _with_principal_point(cov)
     if not a:
         return [*messages, "the principal point is fixed: its error is part of the misalignment"]
     angle = _ANGLES[a.removesuffix("_rad")[-1]]
-    sentence = f"correlation with the principal point at most {rho:+.3f} ({angle}, {b})"
+    sentence = f"largest correlation with the principal point {rho:+.3f} ({angle}, {b})"
     if abs(rho) > HIGH:
         sentence += ": hardly separable; fly cross strips, over relief or at two heights, or fix the principal point"
     return [*messages, sentence]
+
+
+def _with_principal_point(cov: Covariance) -> tuple[float, str, str]:
+    return _strongest(cov, lambda x: "].boresight_" in x, lambda x: x.endswith(("].xp_mm", "].yp_mm")))
 
 
 def _strongest(cov: Covariance, first, second) -> tuple[float, str, str]:

@@ -14,7 +14,7 @@ import pandas as pd
 from rich.console import Console
 
 from jaxphoto.errors import InputError
-from jaxphoto.procedures.boresight import BoresightEstimate, Step
+from jaxphoto.procedures.boresight import HIGH, BoresightEstimate, Step
 from jaxphoto.report.findings import as_sentence
 from jaxphoto.report.formatting import label_unit, to_rich
 from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot
@@ -41,6 +41,10 @@ def boresight_verdict(steps: Sequence[Step]) -> str:
     """Summarise the result of the steps in one sentence."""
     failed = [step.number for step in steps if not step.go_on]
     last = steps[-1].number
+    if not failed and abs(rho := steps[-1].correlation) > HIGH:
+        return (
+            f"all four steps passed, but the principal point is correlated with the misalignment ({rho:+.3f}): fix it"
+        )
     if not failed:
         return "the misalignment is usable: all four steps passed"
     names = ", ".join(map(str, failed))
@@ -50,7 +54,9 @@ def boresight_verdict(steps: Sequence[Step]) -> str:
 
 
 def _colour(steps: Sequence[Step]) -> str:
-    return "green" if all(step.go_on for step in steps) else "red"
+    if not all(step.go_on for step in steps):
+        return "red"
+    return "amber" if abs(steps[-1].correlation) > HIGH else "green"
 
 
 def steps_table(steps: Sequence[Step]) -> pd.DataFrame:
@@ -192,7 +198,7 @@ def print_boresight(steps: Sequence[Step], console: Console) -> None:
     """Print the verdict, sigma naught and test of each step, the estimates, and the findings of each step."""
     console.print(plain(steps[0].adjusted.block.title or "block"), style="bold")
     colour = _colour(steps)
-    console.print(f"{colour}: {boresight_verdict(steps)}", style=f"bold {colour}", soft_wrap=True)
+    console.print(f"{colour}: {boresight_verdict(steps)}", style=f"bold {colour.replace('amber', 'yellow')}", soft_wrap=True)
     console.print(to_rich(tests_table(steps), "steps"))
     console.print(to_rich(estimates(steps), f"estimates of step {_result(steps).number} (a posteriori)"))
     if len(table := differences(steps)):

@@ -116,7 +116,7 @@ def plot_draws(draws: pd.DataFrame, summary: pd.DataFrame, quantity: str, ax: Ax
     if sigma > 0:
         at = np.linspace(-4, 4, 200)
         ax.plot(nominal + sigma * at, np.exp(-0.5 * at**2) / sigma / np.sqrt(2 * np.pi), color="tab:blue", lw=1)
-    ax.set_title(label(quantity), fontsize=9)
+    ax.set_title(label(path_words(quantity)), fontsize=9)
     ax.set_yticks([])
     ax.tick_params(labelsize=7)
     ax.locator_params(axis="x", nbins=4)
@@ -138,8 +138,11 @@ def plot_effects(
     ax, predicted = axes_or_new(ax), summary.set_index("quantity")["predicted_sigma"][names].to_numpy()
     fractions = effects[names].to_numpy() / np.where(predicted > 0, predicted, np.nan)
     image = ax.imshow(fractions, cmap="RdBu_r", vmin=-1, vmax=1, aspect="auto")
-    ax.set_xticks(range(len(names)), list(map(label, names)), rotation=45, ha="right", fontsize=8)
-    ax.set_yticks(range(len(effects)), list(map(label, effects["error"])), fontsize=7)
+    columns, rows = (
+        [label(path_words(path).partition(" [")[0]) for path in paths] for paths in (names, effects["error"])
+    )
+    ax.set_xticks(range(len(names)), columns, rotation=45, ha="right", fontsize=8)
+    ax.set_yticks(range(len(effects)), rows, fontsize=7)
     ax.figure.colorbar(image, ax=ax, label="effect of one sigma / predicted sigma")
     return ax
 

@@ -80,7 +80,9 @@ def monte_carlo(
     """
     check_draws(draws)
     if not callable(perturb):
-        raise InputError(f"{perturb!r} is no function of a key and a block; give one, such as jaxphoto.bias(block, ...)")
+        raise InputError(
+            f"{perturb!r} is no function of a key and a block; give one, such as jaxphoto.bias(block, ...)"
+        )
     return readjust(adjusted, DrawnChange(perturb, seed), np.arange(draws), exterior=exterior, points=points)
 
 
