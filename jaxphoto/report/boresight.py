@@ -198,7 +198,8 @@ def print_boresight(steps: Sequence[Step], console: Console) -> None:
     """Print the verdict, sigma naught and test of each step, the estimates, and the findings of each step."""
     console.print(plain(steps[0].adjusted.block.title or "block"), style="bold")
     colour = _colour(steps)
-    console.print(f"{colour}: {boresight_verdict(steps)}", style=f"bold {colour.replace('amber', 'yellow')}", soft_wrap=True)
+    style = f"bold {colour.replace('amber', 'yellow')}"
+    console.print(f"{colour}: {boresight_verdict(steps)}", style=style, soft_wrap=True)
     console.print(to_rich(tests_table(steps), "steps"))
     console.print(to_rich(estimates(steps), f"estimates of step {_result(steps).number} (a posteriori)"))
     if len(table := differences(steps)):
