@@ -45,6 +45,7 @@ QUICK = {
     "extras": ("photos/test_features.py",),
     "georeferencing": ("georeferencing/test_corrections.py", "georeferencing/test_map_frame.py"),
     "io": ("io/test_read_block.py", "io/test_write_block.py"),
+    "later": ("test_front_door.py::test_everything_can_be_found_by_tab",),
     "lidar": ("lidar/test_planes.py",),
     "observations": ("adjustment/test_structure.py",),
     "parameters": ("adjustment/test_structure.py",),

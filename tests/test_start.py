@@ -79,7 +79,7 @@ def test_help_and_version_import_no_library(words):
     if words == ("--help",):
         assert all(name in screen for name in COMMANDS)
     if words == ("compare", "-h"):
-        assert "Example: jaxphoto compare results_2025 results_2026" in screen and "zrot|rot|spr" in screen
+        assert "Example: " in screen and "jaxphoto compare" in screen and "zrot|rot|spr" in screen
 
 
 def test_panels_come_in_their_order(monkeypatch, capsys):

@@ -14,10 +14,11 @@ where the other was observed. Reinstate points that were rejected while blunders
 Sources: Baarda (1968), A testing procedure for use in geodetic networks; Huber (1981), Robust statistics.
 """
 
+import dataclasses
 from collections import Counter
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping
 from itertools import combinations
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import equinox as eqx
 import numpy as np
@@ -124,7 +125,38 @@ def snoop(
     All observations are tested (image points, control, stations and further kinds), but not priors. A row is rejected
     completely: both coordinates of an image point, one coordinate of a control point. With `loss` the search starts
     from that robust adjustment (`jaxphoto.robust`). Raises the errors of `adjust`.
+
+    The search refers residuals to the corrected image: a gross error moves a computed image point far beyond the
+    format, where the distortion polynomial, to which residuals of the measured image refer, is meaningless. The result
+    is adjusted with the residuals of the block.
     """
+    kinds = {name: interior.residuals for name, interior in block.start.unknowns.interior.items()}
+    corrected = dict.fromkeys(kinds, "model")
+    at = None if start is None else _with_residuals(start, corrected)
+    found = _search(_block_with_residuals(block, corrected), at, loss, max_steps, report)
+    if kinds == corrected:
+        return found
+    part, unknowns = _block_with_residuals(found.adjusted.block, kinds), _with_residuals(found.adjusted.unknowns, kinds)
+    return found._replace(adjusted=solve(part, unknowns, part.priors, max_steps))
+
+
+def _with_residuals(unknowns: Unknowns, kinds: Mapping[str, Any]) -> Unknowns:
+    interior = {name: dataclasses.replace(one, residuals=kinds[name]) for name, one in unknowns.interior.items()}
+    return dataclasses.replace(unknowns, interior=interior)
+
+
+def _block_with_residuals(block: Block, kinds: Mapping[str, Any]) -> Block:
+    start = dataclasses.replace(block.start, unknowns=_with_residuals(block.start.unknowns, kinds))
+    return dataclasses.replace(block, start=start, priors=_with_residuals(block.priors, kinds))
+
+
+def _search(
+    block: Block,
+    start: Unknowns | None,
+    loss: AbstractLoss | None,
+    max_steps: int,
+    report: Callable[[str], object],
+) -> Snooped:
     sizes = common_sizes([block])
     best: Snooped | None = None
     failed: list[JaxphotoError] = []
