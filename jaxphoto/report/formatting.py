@@ -200,6 +200,10 @@ def _texts(table: pd.DataFrame, name: str) -> list[str]:
         words = [path_words(v) if _PATH.match(v) else head_of(v) for v in column.astype(str)]
         # Correlations have no unit; a table may have a column of units instead.
         return [word.partition(" [")[0] for word in words] if _HAS_UNIT & set(table.columns) else words
+    if name == "significant" and "parameter" in table:
+        # A test against zero means nothing for c.
+        shown = column.astype(object).where(table["parameter"] != "c_mm", None)
+        return ["" if pd.isna(v) else _word(v) for v in shown]
     if name == "group":
         return [str(v).replace("_", " ") for v in column]
     if not pd.api.types.is_float_dtype(column):

@@ -386,7 +386,7 @@ def interior_table(tables: Tables, start: InteriorOrientation | None = None, fac
             "prior sigma": of_sigma(float(prior.sigma)) if isinstance(prior, Weighted) else "",
             "value": with_sigma(p["value"], sigma), "sigma": of_sigma(sigma) if sigma > 0 else "fixed",
             "unit": p["unit"], "in pixels": in_px,
-            "significant": {True: "yes", False: "no"}.get(p["significant"], ""),
+            "significant": "" if name == "c_mm" else {True: "yes", False: "no"}.get(p["significant"], ""),
         })  # fmt: skip
     shown = without_empty(pd.DataFrame(rows))
     return shown if len(tables.adjusted.unknowns.interior) > 1 else shown.drop(columns="camera")

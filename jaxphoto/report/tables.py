@@ -165,9 +165,7 @@ class Tables:
         for camera, interior in self.adjusted.unknowns.interior.items():
             for name in (*parameter_names(interior), *constant_names(interior)):
                 test = tests.get((camera, name))
-                # A test against zero means nothing for c; not missing, so that dropna() keeps its row.
-                shown = "" if name == "c_mm" else test and test.significant
-                tested = (test.sigma, shown) if test else (np.nan, None)
+                tested = (test.sigma, test.significant) if test else (np.nan, None)
                 value = float(get_parameter(interior, name))
                 rows.append((camera, name, value, *tested, parameter_unit(interior, name)))
         return pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma", "significant", "unit"])

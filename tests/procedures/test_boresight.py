@@ -101,7 +101,7 @@ def test_each_step_uses_what_the_paper_says():
     assert len(made[3].adjusted.block.check.who) == len(block().check.who) + 15
     assert "no previous problem" in said(made[0])
     assert "5 check points" in said(made[3])
-    rho = [f for f in made[2].findings if f.startswith("correlation with the principal point")]
+    rho = [f for f in made[2].findings if f.startswith("largest correlation with the principal point")]
     assert len(rho) == 1
     assert "yp_mm" in rho[0] or "xp_mm" in rho[0]
 
