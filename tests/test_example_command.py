@@ -66,8 +66,8 @@ def test_what_is_to_be_typed_next_is_a_command_and_its_options(example):
 def test_the_wheel_has_all_that_its_user_needs(tmp_path):
     if find_spec("hatchling") is None:
         pytest.skip("hatchling builds the wheel: install it, as pip install -e '.[dev]' does")
-    build = [sys.executable, "-m", "pip", "wheel", "-q", "--no-deps", "--no-build-isolation", "-w", tmp_path, ROOT]
-    subprocess.run(build, check=True)
+    build = [sys.executable, "-m", "hatchling", "build", "-t", "wheel", "-d", tmp_path]
+    subprocess.run(build, check=True, cwd=ROOT)
     (wheel,) = tmp_path.glob("*.whl")
     with zipfile.ZipFile(wheel) as packed:
         names = set(packed.namelist())

@@ -31,6 +31,8 @@ _SIDE = 8
 _CELLS = 120
 # Number of nearest object points whose median height is the height of a cell.
 _NEIGHBOURS = 5
+# Minimum number of images of a camera whose format is compared with their image points.
+_IMAGES = 3
 # Margin of the coverage map around points and stations, as a fraction of the flying height.
 _MARGIN = 0.5
 
@@ -150,11 +152,16 @@ def format_coverage(adjusted: Adjustment, camera: str) -> FormatCoverage:
 
 
 def size_mismatches(block: Block) -> dict[str, Mismatch]:
-    """Detect image points that do not fit the format of their camera, by camera (`size_mismatch`)."""
+    """Detect image points that do not fit the format of their camera, by camera (`size_mismatch`).
+
+    A camera with few images is not judged: their points may be anywhere.
+    """
     rows = block.image_points
     camera = np.array(block.image_camera)[np.asarray(rows.image)]
     found = {
-        name: size_mismatch(sensor, np.asarray(rows.xy).T[:, camera == name]) for name, sensor in block.sensors.items()
+        name: size_mismatch(sensor, np.asarray(rows.xy).T[:, camera == name])
+        for name, sensor in block.sensors.items()
+        if block.image_camera.count(name) >= _IMAGES
     }
     return {name: mismatch for name, mismatch in found.items() if mismatch}
 

@@ -67,7 +67,7 @@ def test_flat_ground_and_vertical_images_leave_c_open(tmp_path):
     open_ = {"c_mm", "xp_mm", "yp_mm"}
     assert not open_ & set(oriented.report.estimated)
     said = next(sentence for sentence in oriented.report.observed if sentence.startswith("c_mm of the camera is "))
-    assert "observed at its initial value, 8.8 +- 0.88: its sigma from the images alone shifts the corner" in said
+    assert "8.8 +- 0.88" in said
     write_block(oriented.block, tmp_path / "block")
     priors = read_block(tmp_path / "block").priors.interior["camera"]
     for name, sigma in (("c_mm", 0.88), ("xp_mm", 0.15)):
