@@ -77,6 +77,7 @@ if TYPE_CHECKING:
     from jaxphoto.procedures.orientation import orient
     from jaxphoto.procedures.robust import robust
     from jaxphoto.procedures.snooping import snoop
+    from jaxphoto.procedures.weights import estimate_weights
     from jaxphoto.report import Tables
     from jaxphoto.sensitivity import bias, monte_carlo, readjust
     from jaxphoto.simulation import simulate
@@ -101,8 +102,8 @@ __all__ = [
     "Outcome", "RankError", "Selection", "Sensor", "Start", "StripBias", "Surface", "SurfaceRows", "Tables",
     "Unknowns", "Weighted", "adjust", "angle_differences", "bias", "boresight", "calibrate", "common_sizes",
     "compare", "conversion_error", "convert", "correlated", "covariance", "decentring_from_symmetry",
-    "default_priors", "direct_orientation", "georeference", "ground_point", "halves", "image_ray", "index_of",
-    "intersect", "monte_carlo", "orient", "point_differences", "principal_points", "project", "read_block",
+    "default_priors", "direct_orientation", "estimate_weights", "georeference", "ground_point", "halves", "image_ray",
+    "index_of", "intersect", "monte_carlo", "orient", "point_differences", "principal_points", "project", "read_block",
     "read_recipe", "read_source", "readjust", "rebalance", "rebalance_covariance", "robust", "sigma_map",
     "significance", "simulate", "simultaneous", "snoop", "symmetry_from_decentring", "variance_components",
     "write_block", "write_simulation",

@@ -50,7 +50,10 @@ def adjust(
     max_steps: opt.MaxSteps = 100,
     weights: Annotated[
         str | None,
-        Option(help="Estimate variance components by group, or comma-separated by xy-z, axis, camera, image."),
+        Option(
+            help="Estimate variance components by group, or comma-separated by xy-z, axis, camera, image; or use the "
+            "standard deviations as stated. Default: of the parts whose residuals contradict them."
+        ),
     ] = None,
     no_report: Annotated[bool, Option("--no-report", help="Write tables only, without report.html.")] = False,
 ) -> None:
@@ -64,13 +67,14 @@ def adjust(
     from jaxphoto.losses import LOSSES
     from jaxphoto.procedures.adjust import adjust_for_tables
     from jaxphoto.procedures.snooping import inflated_components
+    from jaxphoto.procedures.weights import estimate_weights
     from jaxphoto.statistics import SPLITS
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.certificate import Provenance
 
     splits = tuple(dict.fromkeys(opt.names(weights)))
-    if unknown := [name for name in splits if name not in (*SPLITS, "group")]:
-        raise typer.BadParameter(f"--weights {unknown[0]}: choose from group, {', '.join(SPLITS)}.")
+    if unknown := [name for name in splits if name not in (*SPLITS, "group") and weights != "stated"]:
+        raise typer.BadParameter(f"--weights {unknown[0]}: choose from stated, group, {', '.join(SPLITS)}.")
     splits = tuple(name for name in splits if name != "group")
     check_folder(out, block)
     if not no_report:
@@ -88,15 +92,17 @@ def adjust(
             loss = LOSSES[robust]() if robust else None
             snooped = jaxphoto.snoop(read, loss=loss, max_steps=max_steps, report=progress.update)
         adjusted = snooped.adjusted if snooped else adjust_for_tables(read, max_steps, progress.update)
-        if weights is not None and bool(adjusted.converged):
+        if weights is None and bool(adjusted.converged):
+            components = estimate_weights(adjusted, max_steps=max_steps, report=progress.update)
+        elif weights != "stated" and bool(adjusted.converged):
             progress.update("estimating variance components")
             components = jaxphoto.variance_components(adjusted, splits, max_steps=max_steps)
             masked += inflated_components(adjusted, components, splits, max_steps=max_steps)
-            adjusted = components.adjusted
+        stated, adjusted = adjusted, components.adjusted if components else adjusted
         progress.update("computing statistics")
         tables = jaxphoto.Tables(adjusted, rotations, read_truth(block))  # type: ignore[arg-type]
         findings = report.snooped_findings(snooped, read) if snooped else []
-        findings += report.component_findings(components, masked) if components else []
+        findings += report.component_findings(components, masked, stated) if components else []
         verdict = report.Verdict.of([*findings, *report.verdict_of(tables).findings])
         progress.update(f"writing {out}")
         times = adjusted.seconds | seconds

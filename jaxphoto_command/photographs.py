@@ -200,8 +200,9 @@ def control(
     from jaxphoto.io import read_block
     from jaxphoto.io.block_folder import whole_block
     from jaxphoto.procedures.adjust import adjust
-    from jaxphoto.procedures.control import at_optimum, control_block
-    from jaxphoto.report import Tables, verdict_of
+    from jaxphoto.procedures.control import at_optimum, control_block, retest
+    from jaxphoto.procedures.weights import estimate_weights
+    from jaxphoto.report import Tables, component_findings, component_tables, verdict_of
     from jaxphoto.report.findings import Verdict
     from jaxphoto.report.page import versions
     from jaxphoto.report.photographs import control_findings, control_summary, write_control
@@ -220,9 +221,13 @@ def control(
         result = control_block(
             oriented, points, system=control_epsg, code=code, vertical=vertical, report=progress.update
         )
+        stated = result.adjusted
+        components = estimate_weights(stated, report=progress.update) if bool(stated.converged) else None
+        result = retest(result, components.adjusted) if components else result
         progress.update("computing statistics")
         tables, adjusted = Tables(result.adjusted), result.adjusted
-        verdict = Verdict.of([*verdict_of(tables).findings, *control_findings(result)])
+        weights = component_findings(components, stated=stated) if components else []
+        verdict = Verdict.of([*weights, *verdict_of(tables).findings, *control_findings(result)])
         progress.update(f"writing {out}")
         images = adjusted.block.images
         times = {name: adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
@@ -230,6 +235,8 @@ def control(
             with whole_folder(work / "result") as folder:
                 method = {"block": "../block", **output.options()}
                 write_results(tables, verdict, folder, times, method, output.command_record(block, file, marks))
+                for name, table in (component_tables(components) if components else {}).items():
+                    table.to_csv(folder / f"{name}.csv", index=False)
                 provenance.write(images, folder)
             write_control(result, work)
             write_summary({**verdict.summary, **control_summary(result), "versions": versions()}, work)

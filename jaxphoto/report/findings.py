@@ -23,7 +23,7 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 COLOURS: dict[Severity, str] = {"error": "red", "warning": "amber", "note": "green"}
 MARKS: dict[Severity, str] = {"error": "!!", "warning": "!", "note": "-"}
 # Findings before others of their severity.
-_FIRST = ("common_bias", "external_reliability")
+_FIRST = ("weights", "common_bias", "external_reliability")
 _DECLARED: dict[str, dict[str, str]] = tomllib.loads(
     (files("jaxphoto.report") / "templates" / "findings.toml").read_text(encoding="utf-8")
 )
@@ -102,7 +102,8 @@ class Verdict:
             return f"red: do not use this result; {several}"
         if self.severity == "warning":
             return f"amber: usable with reservations; {several}"
-        return "green: the observations agree with each other and with their standard deviations"
+        estimated = "estimated " * any(f.code == "weights" for f in self.findings)
+        return f"green: the observations agree with each other and with their {estimated}standard deviations"
 
     @property
     def summary(self) -> dict:

@@ -365,9 +365,14 @@ def component_tables(components: statistics.VarianceComponents) -> dict[str, pd.
 
 
 def component_findings(
-    components: statistics.VarianceComponents, blunders: Sequence[InflatedComponent] = ()
+    components: statistics.VarianceComponents,
+    blunders: Sequence[InflatedComponent] = (),
+    stated: Adjustment | None = None,
 ) -> list[Finding]:
-    """Report components caused by blunders, missing convergence, and groups whose component is not estimable."""
+    """Report components caused by blunders, missing convergence, and groups whose component is not estimable.
+
+    `stated`: adjustment with the stated standard deviations, to report their factors and the change of sigma of c.
+    """
     found = []
     for component in blunders:
         numbers = {"words": few(list(component.words))}
@@ -376,4 +381,32 @@ def component_findings(
         )
     if not components.converged:
         found.append(Finding("components_not_converged", "warning", value=components.iterations))
+    elif stated is not None and components.supported.any():
+        found.append(_estimated_weights(components, stated))
     return found + [Finding("component", "warning", sentence) for sentence in components.warnings.values()]
+
+
+def _estimated_weights(components: statistics.VarianceComponents, stated: Adjustment) -> Finding:
+    """Report the factors of the standard deviations, and the sigma of c with and without them.
+
+    The standard deviations of matched image points are not known beforehand; other factors than theirs are a warning.
+    """
+    factors = {
+        label: float(np.sqrt(f))
+        for label, f, supported in zip(components.labels, components.factor, components.supported, strict=True)
+        if supported
+    }
+    worst = max(factors, key=lambda label: abs(np.log(factors[label])))
+    usual = all(label.startswith(IMAGE_POINTS) and ANOTHER_UNIT < f < NOTHING_FITS for label, f in factors.items())
+    sigmas = []
+    for adjusted in (components.adjusted, stated):
+        labels = [label for label in adjusted.structure.labels if label.endswith(".c_mm")]
+        shared = np.asarray(statistics.covariance(adjusted).shared_sigma)
+        sigmas.append([float(shared[adjusted.structure.labels.index(label)]) for label in labels])
+    effects = [
+        f"; {label} {new:.2g} mm instead of {old:.2g} mm" for label, new, old in zip(labels, *sigmas, strict=True)
+    ]
+    subject = few([f"{label.replace('_', ' ')} {f:.3g}" for label, f in factors.items()])
+    numbers = {"effect": effects[0].replace("; ", "; sigma of ") if effects else ""}
+    severity: Severity = "note" if usual else "warning"
+    return Finding("weights", severity, subject, factors[worst], 1.0, numbers=numbers)

@@ -223,6 +223,8 @@ def report_page(
     """
     block = tables.adjusted.block
     summary = summary_table(tables)
+    if weights := [f.subject for f in verdict.findings if f.code == "weights"]:
+        summary["standard deviations"] = f"a posteriori; those of observations estimated, times stated: {weights[0]}"
     if seconds:
         each = ", ".join(f"{name} {value:.2g} s" for name, value in seconds.items())
         summary["computing time"] = f"{sum(seconds.values()):.2g} s ({each})"

@@ -44,7 +44,7 @@ def print_adjustment(tables: Tables, verdict: Verdict, console: Console) -> None
     adjusted = tables.adjusted
     console.print(plain(adjusted.block.title or "block"), style="bold")
     print_verdict(verdict, console)
-    console.print(f"{adjusted.outcome.value} ({int(adjusted.steps)} iterations)")
+    console.print(f"{adjusted.outcome.value} ({counted(int(adjusted.steps), 'iteration')})")
     print_sigma0(adjusted, console)
     shown = {
         "interior orientation (a posteriori)": tables.interior[tables.interior["sigma"].notna()],

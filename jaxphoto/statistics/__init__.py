@@ -28,7 +28,13 @@ from jaxphoto.statistics.discrepancy import (
     point_differences,
     residual_spread,
 )
-from jaxphoto.statistics.global_test import expected_residual_scale, global_test, group_factors
+from jaxphoto.statistics.global_test import (
+    VarianceFactor,
+    expected_residual_scale,
+    global_test,
+    group_factors,
+    part_factors,
+)
 from jaxphoto.statistics.hat_matrix import prepare_hat_matrix
 from jaxphoto.statistics.quantiles import chi_square_limit
 from jaxphoto.statistics.reliability import (
@@ -70,6 +76,7 @@ from jaxphoto.statistics.systematic_effects import (
 from jaxphoto.statistics.variance_components import (
     SPLITS,
     Partition,
+    Parts,
     Selection,
     VarianceComponents,
     partial_redundancy,
@@ -81,14 +88,15 @@ __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_SIGMA0", "LEVEL", "MAX_GROUPS",
     "SIGNIFICANCE_LEVEL", "SIGNIFICANT_RATIO", "SPLITS", "UNCHECKED", "AxisErrors", "BlunderTest",
     "CameraDifferences", "CameraDrift", "Correlations", "Covariance", "EffectTerm",
-    "EffectTest", "GroundCorrelations", "MdbEffects", "Partition", "Redundancy", "Rotations",
-    "Selection", "Significance", "Suspect", "SystematicEffect", "TermEstimate", "VarianceComponents", "ZeroTest",
+    "EffectTest", "GroundCorrelations", "MdbEffects", "Partition", "Parts", "Redundancy", "Rotations",
+    "Selection", "Significance", "Suspect", "SystematicEffect", "TermEstimate", "VarianceComponents", "VarianceFactor",
+    "ZeroTest",
     "a_priori_sigmas", "angle_differences", "blunder_test", "camera_drifts", "camera_spline_differences",
     "check_discrepancies", "chi_square_limit", "chi_square_p", "common_covariance", "correlation_matrix",
     "correlations", "covariance", "critical_w", "expected_residual_scale", "fix_at_zero", "global_test",
     "ground_correlations", "group_factors", "largest_interior_effects", "largest_mdbs", "linear_forms",
     "mdb_effects", "minimal_detectable_biases", "multiple_outlier_test", "normalised_residuals",
-    "observation_groups", "partial_redundancy", "partition_observations", "physical_residuals", "point_differences",
-    "prepare_hat_matrix", "prepare_statistics", "redundancy_numbers", "residual_spread",
+    "observation_groups", "part_factors", "partial_redundancy", "partition_observations", "physical_residuals",
+    "point_differences", "prepare_hat_matrix", "prepare_statistics", "redundancy_numbers", "residual_spread",
     "significance", "strip_differences", "systematic_effect_tests", "variance_components",
 ]  # fmt: skip

@@ -18,6 +18,7 @@ from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.quantiles import chi_square_tails
 from jaxphoto.statistics.reliability import Redundancy
+from jaxphoto.statistics.variance_components import Parts
 
 
 @pretty_repr
@@ -54,13 +55,24 @@ def global_test(adjusted: Adjustment, redundancy: Redundancy | None = None) -> V
 
 def group_factors(adjusted: Adjustment, redundancy: Redundancy) -> list[VarianceFactor]:
     """Test the variance factor of every group with a redundancy of at least one."""
-    factors = []
-    for name in observation_groups(adjusted):
-        v, numbers = np.asarray(adjusted.residuals[name]), np.asarray(redundancy[name])
-        if (r := float(numbers.sum())) >= 1:
-            expected = float(numbers.sum(axis=0) @ _expected(adjusted)) / r if name == IMAGE_POINTS else 1.0
-            factors.append(_tested(name, v.size, float((v**2).sum()), r, expected))
-    return factors
+    names = tuple(observation_groups(adjusted))
+    whole = {name: np.full(np.shape(adjusted.residuals[name]), k) for k, name in enumerate(names)}
+    return part_factors(adjusted, Parts(names, whole), redundancy)
+
+
+def part_factors(adjusted: Adjustment, parts: Parts, redundancy: Redundancy) -> list[VarianceFactor]:
+    """Test the variance factor of every part with a redundancy of at least one."""
+    sums = np.zeros((4, len(parts.labels) + 1))
+    for name, part in parts.part_of.items():
+        v, r = np.asarray(adjusted.residuals[name]), np.asarray(redundancy[name])
+        expected = r * _expected(adjusted) if name == IMAGE_POINTS else r
+        for total, values in zip(sums, (np.ones(v.shape), v**2, r, expected), strict=True):
+            total += np.bincount(part.ravel(), values.ravel(), minlength=len(total))
+    return [
+        _tested(label, int(n), square, r, expected / r)
+        for label, n, square, r, expected in zip(parts.labels, *sums[:, :-1].tolist(), strict=True)
+        if r >= 1
+    ]
 
 
 def expected_residual_scale(adjusted: Adjustment) -> dict[str, float]:

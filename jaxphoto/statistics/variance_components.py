@@ -65,10 +65,6 @@ class Selection(NamedTuple):
     points: Collection[str] = ()
 
 
-Partition = Sequence[str] | Mapping[str, Selection | Sequence[Selection]]
-"""Names of splits (`SPLITS`), or the selections of each label. Without splits, each group is one part."""
-
-
 @pretty_repr
 class Parts(NamedTuple):
     """Partition of the observations of one adjustment."""
@@ -85,7 +81,14 @@ class Parts(NamedTuple):
         parts = np.concatenate([np.ravel(v) for v in self.part_of.values()])
         return np.bincount(parts, minlength=len(self.labels) + 1)[: len(self.labels)]
 
+    def only(self, labels: Sequence[str]) -> "Parts":
+        """Return the parts `labels`; all other observations are without a part."""
+        number = np.array([labels.index(k) if k in labels else len(labels) for k in (*self.labels, "")])
+        return Parts(tuple(labels), {name: number[part] for name, part in self.part_of.items()})
 
+
+Partition = Sequence[str] | Mapping[str, Selection | Sequence[Selection]] | Parts
+"""Names of splits (`SPLITS`), the selections of each label, or parts. Without splits, each group is one part."""
 Names = Shaped[np.ndarray, "..."]
 _Split = Callable[[AbstractObservations, Block], Names | None]
 
@@ -125,6 +128,8 @@ def partition_observations(adjusted: Adjustment, partition: Partition) -> Parts:
     Raises InputError for an unknown split, group or name, a label without observations, observations with two labels,
     and correlated rows in different parts.
     """
+    if isinstance(partition, Parts):
+        return partition
     rows = observed_rows(adjusted)
     if isinstance(partition, Mapping):
         names, labels = _selected(adjusted, rows, partition), tuple(partition)

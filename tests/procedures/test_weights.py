@@ -1,13 +1,15 @@
-"""Variance components inflated by a few blunders are distinguished from wrong weights."""
+"""Variance components: inflated by a few blunders, or required by wrong standard deviations."""
 
 import dataclasses
 
+import jax
 import numpy as np
 import pytest
 
-from jaxphoto import adjust, variance_components
+from jaxphoto import adjust, covariance, estimate_weights, variance_components
 from jaxphoto.procedures.snooping import inflated_components
 from jaxphoto.report import component_findings
+from jaxphoto.simulation import remeasure
 from tests.blocks import adjusted_example, example
 
 
@@ -49,3 +51,54 @@ def test_sigmas_that_were_stated_too_small_are_not(block):
 
 def test_nothing_is_made_of_a_sound_block(block):
     assert not found_in(block)[1]
+
+
+# Estimated weights: only of parts whose residuals contradict their standard deviations
+
+
+def with_sigmas_times(block, factors):
+    named = block.named_observations
+    return block.with_observations({name: named[name].with_sigmas_times(np.asarray(f)) for name, f in factors.items()})
+
+
+def test_valid_standard_deviations_are_not_estimated():
+    assert estimate_weights(adjusted_example()) is None
+
+
+@pytest.mark.parametrize("factor", [3.0, 0.4])
+def test_a_wrong_sigma_of_image_points_is_estimated_and_no_other(block, factor):
+    adjusted = adjusted_example()
+    estimated = estimate_weights(adjust(with_sigmas_times(block, {"image_points": factor})))
+    assert estimated.labels == ("image_points",)
+    assert np.sqrt(estimated.factor[0]) * factor == pytest.approx(1.0, abs=0.1)
+    # Standard deviations are those of the block with the right weights.
+    sigmas = [np.asarray(covariance(a).shared_sigma) for a in (estimated.adjusted, adjusted)]
+    np.testing.assert_allclose(*sigmas, rtol=0.1)
+
+
+@pytest.fixture(scope="module")
+def precise(block):
+    """The block measured with a twentieth of the image noise: its stations check one another."""
+    return remeasure(with_sigmas_times(block, {"image_points": 0.05}), adjusted_example().unknowns, jax.random.key(1))
+
+
+def test_stations_with_too_small_sigmas_are_estimated(precise):
+    estimated = estimate_weights(adjust(with_sigmas_times(precise, {"stations": 0.1})))
+    assert set(estimated.labels) == {"stations X-Y", "stations Z"}
+    np.testing.assert_allclose(np.sqrt(estimated.factor), 10.0, rtol=0.3)
+
+
+def test_a_shifted_strip_or_a_wrong_height_is_not_a_weight(block):
+    stations, control = block.stations, block.control
+    of_strip = np.array(block.image_strip)[stations.who] == block.image_strip[0]
+    shifted = np.asarray(stations.value) + np.where(of_strip & (stations.axis == 0), 3.0, 0.0)
+    assert (
+        estimate_weights(adjust(block.with_observations({"stations": dataclasses.replace(stations, value=shifted)})))
+        is None
+    )
+    wrong = np.array(control.value)
+    wrong[(control.who == block.points.index("T11")) & (control.axis == 2)] += 2.0
+    assert (
+        estimate_weights(adjust(block.with_observations({"control_points": dataclasses.replace(control, value=wrong)})))
+        is None
+    )

@@ -181,7 +181,7 @@ def test_unknown_weights_are_one_sentence_and_nothing_written(monkeypatch, capsy
     out = tmp_path / "out"
     code, _, error = run(monkeypatch, capsys, "adjust", tmp_path, "--out", out, "--weights", "xy-z,colour")
     assert code == 2
-    assert "--weights colour: choose from group, xy-z, axis, camera, image" in error
+    assert "--weights colour: choose from stated, group, xy-z, axis, camera, image" in error
     assert not out.exists()
 
 
