@@ -308,13 +308,18 @@ def _check_upright(block: Block, similarity: Similarity) -> None:
 
     Stations of a flight are nearly coplanar: mirrored positions also fit an inverted block.
     """
-    ahead = -np.asarray(block.start.unknowns.exterior.camera_from_object, float)[:, 2] @ similarity.turn.T
-    if float(np.median(ahead[:, 2])) > _LOOK_UP:
+    if looks_up(block, similarity):
         raise InputError(
             "with these positions the photographs would look upwards: positions are mirrored (X and Y, or latitude and "
             "longitude exchanged, or a sign lost), or nearly on a line, which leaves the rotation about it "
             "undetermined. Correct or omit their file"
         )
+
+
+def looks_up(block: Block, similarity: Similarity) -> bool:
+    """Return True if the images look upwards after the transformation of the block by `similarity`."""
+    ahead = -np.asarray(block.start.unknowns.exterior.camera_from_object, float)[:, 2] @ similarity.turn.T
+    return float(np.median(ahead[:, 2])) > _LOOK_UP
 
 
 def _rotation_sigma(network: Float[np.ndarray, "n 3"], sigma: Float[np.ndarray, "n 3"]) -> float:

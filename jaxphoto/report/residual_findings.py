@@ -12,12 +12,12 @@ from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
 from jaxphoto.camera import get_parameter, parameter_names
-from jaxphoto.errors import camera_words, few
+from jaxphoto.errors import camera_words, counted, few
 from jaxphoto.observations import PRIORS, Correlated
 from jaxphoto.procedures.adjust import ABSURD
 from jaxphoto.procedures.snooping import SEVERAL, InflatedComponent, Snooped, mostly_rejected, rejected_images
 from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words
-from jaxphoto.report.formatting import in_file_unit, symbol
+from jaxphoto.report.formatting import in_file_unit, plus_minus, symbol
 from jaxphoto.report.tables import Tables
 from jaxphoto.unknowns import Weighted
 
@@ -28,6 +28,7 @@ NOTHING_FITS = 3.0
 MOST_OF_IT = 0.5
 """Fraction of a systematic effect's sum of squares above which a single term explains it."""
 _SHOWN = 3
+_Term = tuple[statistics.SystematicEffect, statistics.EffectTerm]
 _NOT_DISTORTION = ("c_mm", "xp_mm", "yp_mm")
 # Ratio of |w| to the critical value, and shift of an interior parameter (sigma), above which a blunder is an error;
 # minimum reported shift (sigma).
@@ -45,7 +46,10 @@ _HIDDEN = 10.0
 
 
 def residual_findings(tables: Tables) -> Iterator[Finding]:
-    """Yield the tests of sigma naught, of single residuals and of systematic effects."""
+    """Yield the tests of sigma naught, of single residuals and of systematic effects.
+
+    Large errors are estimated as unknowns (`statistics.error_sizes`), and effects that they explain are omitted.
+    """
     yield from _global_test(tables)
     fits = statistics.global_test(tables.adjusted, tables.redundancy).sigma <= ABSURD
     effects, suspects = list(_systematic(tables, fits)), tables.blunders.suspects
@@ -54,16 +58,46 @@ def residual_findings(tables: Tables) -> Iterator[Finding]:
     worst_w = max((abs(s.w) for s in suspects), default=0.0)
     by_chance = tables.blunders.n * float(scipy.special.erfc(worst_w / np.sqrt(2)))
     first = [e for e in effects if e.chance < by_chance] if suspects and fits else []
-    blunders = list(_blunders(tables, tables.culprits)) if first else []
-    worst = min((SEVERITIES.index(f.severity) for f in blunders), default=len(SEVERITIES) - 1)
-    for effect in first:
+    terms = [pair for effect in first[:1] for pair in effect.terms]
+    culprits = statistics.multiple_outlier_test(tables.adjusted, tables.blunders, terms) if terms else tables.culprits
+    sizes = _sizes(tables, culprits, terms or [pair for e in effects[:1] if not suspects for pair in e.terms])
+    blunders = list(_blunders(tables, culprits, sizes))
+    names = [e.subject for e in first]
+    if sizes:
+        effects = list(_systematic(tables, fits, sizes))
+    worst = min((SEVERITIES.index(f.severity) for f in _blunders(tables, tables.culprits)), default=len(SEVERITIES) - 1)
+    for effect in (e for e in effects if e.subject in names):
         severity = SEVERITIES[min(SEVERITIES.index(effect.severity), worst)]
         yield effect.finding(severity)
-    terms = [pair for effect in first[:1] for pair in effect.terms]
-    yield from _blunders(
-        tables, statistics.multiple_outlier_test(tables.adjusted, tables.blunders, terms) if terms else tables.culprits
-    )
-    yield from (e.finding(e.severity) for e in effects if all(e is not one for one in first))
+    yield from blunders
+    yield from (e.finding(e.severity) for e in effects if e.subject not in names)
+
+
+# Ratio of an error to its a priori sigma above which first-order theory does not give its size, and maximum
+# number of errors that are estimated together.
+_LARGE, _TOGETHER = 10.0, 16
+
+
+def _sizes(
+    tables: Tables, suspects: Sequence[statistics.Suspect], terms: Sequence[_Term]
+) -> statistics.ErrorSizes | None:
+    """Estimate the errors as unknowns if one of them is large."""
+    names = {(effect.what, term.name) for effect, term in terms}
+    ratios = [abs(s.w) for s in suspects]
+    for t in tables.tested_trends:
+        ratios += [abs(h.amount) / h.sigma for h in t.hints if (t.pattern.what, h.term.name) in names]
+    if not _is_large(tables, max(ratios, default=0.0)) or len(suspects) > _TOGETHER:
+        return None
+    return statistics.error_sizes(tables.adjusted, suspects, terms)
+
+
+def _signed(value: float, sigma: float) -> str:
+    return f"{'+' * (value > 0)}{plus_minus(value, sigma)}"
+
+
+def _is_large(tables: Tables, ratio: float) -> bool:
+    """Return True if first-order theory does not give an error of `ratio` a posteriori standard deviations."""
+    return ratio * float(tables.adjusted.sigma0) > _LARGE
 
 
 def contradictions(tables: Tables) -> Iterator[Finding]:
@@ -125,8 +159,10 @@ def stretch_findings(adjusted: Adjustment) -> Iterator[Finding]:
             yield Finding("stretched", "note", camera_words(camera), factor, 1.0, hint)
 
 
-def _blunders(tables: Tables, suspects: Sequence[statistics.Suspect]) -> Iterator[Finding]:
-    """Yield the most likely blunders.
+def _blunders(
+    tables: Tables, suspects: Sequence[statistics.Suspect], sizes: statistics.ErrorSizes | None = None
+) -> Iterator[Finding]:
+    """Yield the most likely blunders, with their `sizes` if estimated as unknowns.
 
     A blunder is an error if it is far above the critical value or shifts the interior orientation. Otherwise it is a
     warning: among thousands of valid observations a few slightly exceed the limit.
@@ -136,12 +172,19 @@ def _blunders(tables: Tables, suspects: Sequence[statistics.Suspect]) -> Iterato
     judged = [(abs(s.w) > _FAR_OUT * limit or moved > _SPOILT, s, name, moved) for s, name, moved in effects]
     for severe, s, name, moved in sorted(judged, key=lambda j: not j[0])[:_SHOWN]:
         factor, unit = in_file_unit(s.unit)
+        error, sigma = sizes.suspects[s.group, s.row, s.number] if sizes else (s.error, s.sigma)
+        size = f"{_signed(factor * error, factor * sigma)} {unit} if it alone is wrong"
+        if sizes:
+            others = len(sizes.suspects) + len(sizes.terms) - 1
+            size = size.replace("it alone is", f"it and {counted(others, 'other error')} are") if others else size
+        elif _is_large(tables, abs(s.w)):
+            size = f"about {factor * error:+.2g} {unit} (its standard deviation is not known)"
         numbers = {
-            "sigma": factor * s.sigma, "unit": unit, "w": s.w,
+            "size": size, "w": s.w,
             "effect": f"; it moves {symbol(name)} by {moved:.1g} sigma" if moved > _REPORTED else "",
         }  # fmt: skip
         severity: Severity = "error" if severe else "warning"
-        yield Finding("blunder", severity, s.words, factor * s.error, limit, numbers=numbers)
+        yield Finding("blunder", severity, s.words, factor * error, limit, numbers=numbers)
     if explained := len(tables.blunders.suspects) - len(judged):
         yield Finding("explained_suspects", "note", value=explained, limit=limit)
     if len(judged) > _SHOWN:
@@ -171,7 +214,7 @@ class _Effect(NamedTuple):
     value: float
     limit: float
     numbers: dict[str, Any]
-    terms: tuple[tuple[statistics.SystematicEffect, statistics.EffectTerm], ...]
+    terms: tuple[_Term, ...]
     """Terms that explain most of the effect."""
 
     def finding(self, severity: Severity) -> Finding:
@@ -179,10 +222,14 @@ class _Effect(NamedTuple):
         return Finding("systematic", severity, self.subject, self.value, self.limit, numbers=self.numbers)
 
 
-def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
-    """Yield significant systematic effects by increasing p-value; effects of cameras only if `fits`."""
+def _systematic(tables: Tables, fits: bool, sizes: statistics.ErrorSizes | None = None) -> Iterator[_Effect]:
+    """Yield significant systematic effects by increasing p-value; effects of cameras only if `fits`.
+
+    With the `sizes` of errors estimated as unknowns, effects that these explain are omitted.
+    """
     level = statistics.LEVEL / max(len(tables.tested_trends), 1)
-    found = (t for t in tables.tested_trends if t.p_value < level and (fits or not t.pattern.camera))
+    tests = _with_sizes(tables, sizes, level) if sizes else tables.tested_trends
+    found = (t for t in tests if t.p_value < level and (fits or not t.pattern.camera))
     for t in sorted(found, key=lambda t: t.p_value ** (_SIMILAR if t.pattern.begins else 1.0)):
         factor, unit = in_file_unit(t.pattern.unit)
         detail, likely, spoilt = "", list[statistics.TermEstimate](), False
@@ -195,7 +242,8 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
         if together or (t.hints and t.hints[0].share > MOST_OF_IT):
             likely = together or [t.hints[0]]
             fraction = "" if together else f"{100 * t.hints[0].share:.0f} % of it "
-            detail += f", {fraction}{_terms(t.pattern, likely)}"
+            known = sizes is not None and any(what == t.pattern.what for what, _ in sizes.terms)
+            detail += f", {fraction}{_terms(tables, t.pattern, likely, known)}"
             moves = {path: abs(sum(h.moves[path] for h in likely)) for path in likely[0].moves}
             path = max(moves, key=lambda path: moves[path], default="")
             if path and (moved := moves[path]) > _MOVED:
@@ -204,7 +252,7 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
         elif t.pattern.camera:
             detail += ": no single common term explains most of it; try a model with more terms (docs/stability.md)"
         elif several := [h for h in t.hints if abs(h.amount) > statistics.SIGNIFICANT_RATIO * h.sigma][:_SHOWN]:
-            detail += f", each alone {_terms(t.pattern, several)}"
+            detail += f", each alone {_terms(tables, t.pattern, several)}"
         # Count the suspects explained by the terms: these are not blunders.
         most = t.matching_blunders >= _SHOWN and t.matching_blunders > len(tables.blunders.suspects) / 2
         chance = (0.0 if most else t.p_value) if matters and likely else 1.0
@@ -215,13 +263,51 @@ def _systematic(tables: Tables, fits: bool) -> Iterator[_Effect]:
         yield _Effect(chance, severity, subject, factor * t.size, _VISIBLE * factor * t.sigma, numbers, terms)
 
 
-def _terms(pattern: statistics.SystematicEffect, likely: list[statistics.TermEstimate]) -> str:
-    """Describe the likely terms with their estimates, and the cure."""
+def _terms(
+    tables: Tables, pattern: statistics.SystematicEffect, likely: list[statistics.TermEstimate], known: bool = False
+) -> str:
+    """Describe the likely terms with their estimates, and the cure. `known`: estimated as unknowns."""
     factor, unit = in_file_unit(pattern.unit)
-    amounts = (f" {factor * h.amount:+.3g} +- {factor * h.sigma:.2g} {unit}".rstrip() for h in likely)
-    names = ", ".join(h.term.name + (a if h.term.report_amount else "") for h, a in zip(likely, amounts, strict=True))
+
+    def amount(h: statistics.TermEstimate) -> str:
+        if known or not _is_large(tables, abs(h.amount) / h.sigma):
+            return f" {_signed(factor * h.amount, factor * h.sigma)} {unit}".rstrip()
+        return f" about {factor * h.amount:+.2g} {unit}".rstrip()
+
+    names = ", ".join(h.term.name + (amount(h) if h.term.report_amount else "") for h in likely)
     cure = likely[0].term.cure
     return f"{names}, {cure}" if cure else names
+
+
+def _with_sizes(tables: Tables, sizes: statistics.ErrorSizes, level: float) -> list[statistics.EffectTest]:
+    """Return the tests with the estimated sizes, without effects that are not significant after correction."""
+    shared = np.asarray(statistics.covariance(sizes.adjusted).shared_sigma)
+    left = statistics.systematic_effect_tests(sizes.adjusted, shared)
+    remaining = {t.pattern.what for t in left if t.p_value < level}
+    sigma = dict(zip(sizes.adjusted.structure.labels, shared.tolist(), strict=True))
+    moves = {}
+    for path in (label for label in sigma if label.startswith("interior[") and sigma[label] > 0):
+        camera, name = path.removeprefix("interior[").rsplit("].", 1)
+        value, corrected = (
+            float(get_parameter(a.unknowns.interior[camera], name)) for a in (tables.adjusted, sizes.adjusted)
+        )
+        moves[path] = (value - corrected) / sigma[path]
+    tests = []
+    for t in tables.tested_trends:
+        estimates = {name: size for (what, name), size in sizes.terms.items() if what == t.pattern.what}
+        if estimates:
+            # All terms together move the parameters: the first has the change.
+            hints, change = [], moves
+            for h in t.hints:
+                if h.term.name in estimates:
+                    amount, deviation = estimates[h.term.name]
+                    h, change = h._replace(amount=amount, sigma=deviation, moves=change), dict.fromkeys(moves, 0.0)
+                hints.append(h)
+            ratio = abs(hints[0].amount / t.hints[0].amount) if t.hints[0].amount else 1.0
+            tests.append(t._replace(hints=tuple(hints), size=t.size * ratio))
+        elif t.pattern.what in remaining:
+            tests.append(t)
+    return tests
 
 
 # Reliability -----------------------------------------------------------------------------------------------------

@@ -28,6 +28,7 @@ from jaxphoto.statistics.discrepancy import (
     point_differences,
     residual_spread,
 )
+from jaxphoto.statistics.error_sizes import ErrorSizes, error_sizes
 from jaxphoto.statistics.global_test import (
     VarianceFactor,
     expected_residual_scale,
@@ -88,12 +89,12 @@ __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_SIGMA0", "LEVEL", "MAX_GROUPS",
     "SIGNIFICANCE_LEVEL", "SIGNIFICANT_RATIO", "SPLITS", "UNCHECKED", "AxisErrors", "BlunderTest",
     "CameraDifferences", "CameraDrift", "Correlations", "Covariance", "EffectTerm",
-    "EffectTest", "GroundCorrelations", "MdbEffects", "Partition", "Parts", "Redundancy", "Rotations",
+    "EffectTest", "ErrorSizes", "GroundCorrelations", "MdbEffects", "Partition", "Parts", "Redundancy", "Rotations",
     "Selection", "Significance", "Suspect", "SystematicEffect", "TermEstimate", "VarianceComponents", "VarianceFactor",
     "ZeroTest",
     "a_priori_sigmas", "angle_differences", "blunder_test", "camera_drifts", "camera_spline_differences",
     "check_discrepancies", "chi_square_limit", "chi_square_p", "common_covariance", "correlation_matrix",
-    "correlations", "covariance", "critical_w", "expected_residual_scale", "fix_at_zero", "global_test",
+    "correlations", "covariance", "critical_w", "error_sizes", "expected_residual_scale", "fix_at_zero", "global_test",
     "ground_correlations", "group_factors", "largest_interior_effects", "largest_mdbs", "linear_forms",
     "mdb_effects", "minimal_detectable_biases", "multiple_outlier_test", "normalised_residuals",
     "observation_groups", "part_factors", "partial_redundancy", "partition_observations", "physical_residuals",

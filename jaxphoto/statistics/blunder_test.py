@@ -133,23 +133,23 @@ def multiple_outlier_test(
     rows = [np.ravel(hat_matrix.places[s.group][..., s.row]) for s in tested]
     largest_component = [int(np.atleast_2d(hat_matrix.places[s.group])[s.number, s.row]) for s in tested]
     at, n = np.concatenate(rows), len(effects)
-    effect_columns = _columns(hat_matrix, effects)
+    term_columns = effect_columns(hat_matrix, effects)
 
     def column(k: int) -> np.ndarray:
         return (
-            effect_columns[k] if k < n else np.bincount(at[k - n : k - n + 1], minlength=hat_matrix.count).astype(float)
+            term_columns[k] if k < n else np.bincount(at[k - n : k - n + 1], minlength=hat_matrix.count).astype(float)
         )
 
     unadjusted = np.eye(n + len(at))
     unadjusted[:n, :n], unadjusted[:n, n:], unadjusted[n:, :n] = (
-        effect_columns @ effect_columns.T,
-        effect_columns[:, at],
-        effect_columns[:, at].T,
+        term_columns @ term_columns.T,
+        term_columns[:, at],
+        term_columns[:, at].T,
     )
     c = unadjusted - hat_matrix.products(column, n + len(at))[0]
     v = hat_matrix.residuals
     sum_of_squares, unknowns = float(v @ v), [n + np.flatnonzero(np.isin(at, row_index)) for row_index in rows]
-    u = np.concatenate([effect_columns @ v, v[at]])
+    u = np.concatenate([term_columns @ v, v[at]])
     min_fraction = min([MIN_FRACTION, *(pattern.min_fraction for pattern, _ in effects)])
     chosen: list[int] = [] if n else [0]
     while len(chosen) < len(tested):
@@ -171,7 +171,7 @@ def multiple_outlier_test(
     return (*(tested[i] for i in chosen), *others)
 
 
-def _columns(
+def effect_columns(
     hat_matrix: HatMatrix, effects: Sequence[tuple[SystematicEffect, EffectTerm]]
 ) -> Float[np.ndarray, "terms count"]:
     """Return each term as whitened errors of all observations. The columns of `effects` are recomputed."""

@@ -121,7 +121,7 @@ def test_a_changed_camera_is_the_first_finding():
     verdict = verdict_of(tables)
     assert verdict.colour == "red"
     assert "contradicts the prior information of camera kodak" in verdict.texts[0]
-    assert "c_mm -0.06" in verdict.texts[0]
+    assert "c_mm about -0.06" in verdict.texts[0]
     # As surprising as the difference from the calibration by this block alone, by the covariances of both.
     (found,) = [t for t in tables.tested_trends if t.pattern.begins]
     alone = adjust(larger)

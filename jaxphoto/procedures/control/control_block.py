@@ -40,7 +40,7 @@ from jaxphoto.procedures.control.surveyed import (
     places,
     system_of,
 )
-from jaxphoto.procedures.georeference_photographs import utm_of
+from jaxphoto.procedures.georeference_photographs import looks_up, utm_of
 from jaxphoto.procedures.orientation.blocks import Similarity, similarity_between
 from jaxphoto.statistics import LEAST_CHECKED, covariance, normalised_residuals, redundancy_numbers
 
@@ -437,6 +437,8 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
         spread = spread * first.similarity.scale
     onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file)
     agree[known] = onto.agree
+    if not frame.at_place:
+        _check_handedness(block, onto, met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file)
     messages = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} define the frame of the block"]
     if frame.at_place:
         off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
@@ -445,6 +447,22 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
         messages.append(f"offset of the control from {there}: {offset} m (east, north, up)")
     block = dataclasses.replace(onto.similarity.of_block(block), frame=frame.frame)
     return block, onto.similarity.of(met), agree, messages
+
+
+def _check_handedness(block: Block, onto: OntoControl, there, here, sigma_m, file: str) -> None:
+    """Raise InputError if all images look up and the control fits as well with X and Y exchanged.
+
+    A mirrored plan on flat ground is that of a block turned by half a turn about a horizontal axis.
+    """
+    if not looks_up(block, onto.similarity):
+        return
+    exchanged = _best(there, here[:, [1, 0, 2]], sigma_m)
+    if exchanged is not None and exchanged.agree.sum() >= onto.agree.sum():
+        raise InputError(
+            f"{file}: with these coordinates all images would be below the ground and look up. With X and Y exchanged "
+            "they fit as well, and the images look down: exchange the two columns, or correct the sign of one axis. If "
+            "the images do look up (a ceiling), survey a point off the plane of the others"
+        )
 
 
 def _assumed(control: GivenControl) -> list[str]:
