@@ -5,13 +5,13 @@ corrects all standard deviations. With other observations (stations, control, li
 well, and sigma naught, dominated by the image points, scales the standard deviations of the others too.
 
 The parts (`SPLITS`: X-Y and Z of a group, image points by camera) are tested by the variance factor of their residuals
-(`group_factors`). The most significant part gets a variance component (restricted maximum likelihood), and the others
-are tested again with the new weights, until none contradicts. All other parts retain their stated standard deviations,
-which are usually better known than a few residuals can tell.
+(`part_factors`). The most significant part, and parts of its group that deviate in the same direction, get variance
+components (restricted maximum likelihood). The others are tested again with the new weights, until none contradicts.
+They retain their stated standard deviations, which are usually better known than a few residuals can tell.
 
 Larger residuals than stated may have other causes. A part keeps its stated standard deviations if a few blunders
-explain the increase (`inflated_components`), or if a shift or drift of a group of observations remains significant with
-the estimated standard deviations: the tests of the adjustment then report these.
+explain the increase (the median of the squared residuals does not have it), or if a shift or drift of a group of
+observations remains significant with the estimated ones: the tests of the adjustment then report these.
 """
 
 from collections.abc import Callable
@@ -19,13 +19,14 @@ from collections.abc import Callable
 import numpy as np
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment
-from jaxphoto.procedures.snooping import inflated_components
+from jaxphoto.errors import few
 from jaxphoto.statistics import (
     LEVEL,
     Parts,
     VarianceComponents,
     VarianceFactor,
     covariance,
+    normalised_residuals,
     part_factors,
     partition_observations,
     redundancy_numbers,
@@ -37,6 +38,9 @@ from jaxphoto.tracing import outside_transformations
 _SPLITS = ("xy-z", "camera")
 # Minimum ratio of the estimated and the stated standard deviation: smaller ones do not change a printed sigma.
 _RATIO = 1.1
+# Ratio of the mean and the median square of normalised residuals, both as estimates of their variance, above which a
+# few blunders explain a large mean. Median of chi-square with one degree of freedom.
+_FEW, _MEDIAN = 4.0, 0.455
 
 
 @outside_transformations
@@ -52,23 +56,21 @@ def estimate_weights(
     if len(parts.labels) < 2:
         return None
     estimated: VarianceComponents | None = None
-    chosen, kept = list[str](), set[str]()
+    chosen, kept = set[str](), set[str]()
     while True:
         current = estimated.adjusted if estimated else adjusted
         contradicting = [f for f in _contradictions(current, parts) if f.group not in kept]
         if not contradicting:
             return estimated
-        worst = contradicting[0]
-        report(f"estimating the standard deviations of {worst.group.replace('_', ' ')}")
-        labels = [label for label in parts.labels if label in (*chosen, worst.group)]
+        worst, too_small = contradicting[0].group.split()[0], contradicting[0].sigma > 1
+        new = {f.group for f in contradicting if f.group.split()[0] == worst and (f.sigma > 1) == too_small}
+        report(f"estimating the standard deviations of {few([label.replace('_', ' ') for label in sorted(new)])}")
+        labels = [label for label in parts.labels if label in chosen | new]
         trial = variance_components(adjusted, parts.only(labels), max_steps=max_steps)
-        kept.add(worst.group)
-        if not trial.converged or worst.group in trial.warnings:
-            continue
-        if worst.sigma > 1 and _has_another_cause(current, trial, worst.group, max_steps):
-            continue
-        # With the new weights, parts that were kept may have a different cause.
-        estimated, chosen, kept = trial, labels, set()
+        kept |= new
+        if trial.converged and not (too_small and _has_another_cause(current, trial, parts, new)):
+            # With the new weights, parts that were kept may have a different cause.
+            estimated, chosen, kept = trial, set(labels), set(trial.warnings)
 
 
 def _contradictions(adjusted: Adjustment, parts: Parts) -> list[VarianceFactor]:
@@ -81,15 +83,22 @@ def _contradictions(adjusted: Adjustment, parts: Parts) -> list[VarianceFactor]:
     return sorted(different, key=lambda f: -abs(np.log(f.sigma)) * f.redundancy**0.5)
 
 
-def _has_another_cause(adjusted: Adjustment, trial: VarianceComponents, label: str, max_steps: int) -> bool:
-    """Return True if blunders, or a shift or drift of a group, explain the large residuals of part `label`.
+def _has_another_cause(adjusted: Adjustment, trial: VarianceComponents, parts: Parts, labels: set[str]) -> bool:
+    """Return True if blunders, or a shift or drift of a group, explain the large residuals of some parts.
 
-    `trial`: adjustment with its component, `adjusted`: without.
+    `trial`: adjustment with their components, `adjusted`: without.
     """
     effects = systematic_effect_tests(trial.adjusted, np.asarray(covariance(trial.adjusted).shared_sigma))
     level = LEVEL / max(len(effects), 1)
     # Tests of effects over the image format do not depend on the weight of the image points.
     if any(e.p_value < level and not e.pattern.camera for e in effects):
         return True
-    components = variance_components(adjusted, _SPLITS, max_steps=max_steps)
-    return any(c.label == label for c in inflated_components(adjusted, components, _SPLITS, max_steps=max_steps))
+    redundancy = redundancy_numbers(adjusted, covariance(adjusted, rows=True))
+    w = normalised_residuals(adjusted, redundancy)
+    for label in labels:
+        k = parts.labels.index(label)
+        of_part = np.concatenate([np.abs(w[name][part == k]) for name, part in parts.part_of.items()])
+        squares = (float(adjusted.sigma0) * of_part[np.isfinite(of_part)]) ** 2
+        if not len(squares) or squares.mean() > _FEW * np.median(squares) / _MEDIAN:
+            return True
+    return False
