@@ -18,7 +18,7 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-_COLUMNS = ("design", "converged", "determined", "quantity", "of", "value", "unit")
+_COLUMNS = ("design", "converged", "determined", "weak", "quantity", "of", "value", "unit")
 _WITH_UNIT = ("sigma", "rms_sigma", "check_sigma", "check_rmse")
 _DEG = 180 / np.pi
 # Ratio of largest to smallest value above which an axis is logarithmic.
@@ -28,7 +28,7 @@ _FAR_APART = 20.0
 def sweep_table(sweep: Sweep) -> pd.DataFrame:
     """Tabulate the sweep, one row per value.
 
-    Columns: design parameters, design, converged, determined, quantity, of, value, unit.
+    Columns: design parameters, design, converged, determined, weak, quantity, of, value, unit.
 
     | quantity | of |
     | --- | --- |
@@ -41,29 +41,35 @@ def sweep_table(sweep: Sweep) -> pd.DataFrame:
 
     Standard deviations are a priori; multiply by `sigma0` for a posteriori values. Unknowns are named by the last part
     of their path, `c_mm`, or by the full path, `interior[kodak].c_mm`, if the short names are not unique. Values are
-    NaN for a design without convergence or with undetermined unknowns. Raises InputError for a parameter named like a
-    column.
+    NaN for a design without convergence or with a rank defect. A design with weakly determined unknowns has values, but
+    `determined` is False and `weak` names the unknowns (`statistics.determinability`). Raises InputError for a
+    parameter named like a column.
     """
     names = list(sweep.parameters[0])
     if taken := [name for name in names if name in _COLUMNS]:
         raise InputError(f"design parameter {taken[0]} has the name of a table column; rename it")
     columns = pd.DataFrame({"|".join(key): values for key, values in _columns(sweep)})
+    short = dict(zip(sweep.labels, _short(sweep.labels), strict=True))
     designs = pd.DataFrame([dict(p) for p in sweep.parameters], columns=names)
-    designs = designs.assign(design=np.arange(len(sweep)) + 1, converged=sweep.converged, determined=sweep.determined)
+    designs = designs.assign(
+        design=np.arange(len(sweep)) + 1,
+        converged=sweep.converged,
+        determined=sweep.determined,
+        weak=[", ".join(short.get(label, label) for label in weak) for weak in sweep.weak],
+    )
     keys = designs.columns.tolist()
     wide = designs.join(columns)
     table = wide.melt(keys, var_name="key", value_name="value").sort_values("design", kind="stable")
     table[["quantity", "of"]] = table.pop("key").str.split("|", expand=True)
     table["unit"] = table["of"].map(lambda of: without_unit(of)[1]).where(table["quantity"].isin(_WITH_UNIT), "")
-    # NaN in a determined design: the design lacks the quantity.
-    usable = table["value"].notna() | ~(table["converged"] & table["determined"])
+    # NaN in a valid design: the design lacks the quantity.
+    usable = table["value"].notna() | table["design"].isin(np.flatnonzero(np.isnan(sweep.sigma0)) + 1)
     return table.loc[usable, [*keys, "quantity", "of", "value", "unit"]].reset_index(drop=True)
 
 
 def _columns(sweep: Sweep) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
     """Yield (quantity, of) and the values of all designs."""
-    last = [label.rpartition("].")[2] for label in sweep.labels]
-    labels = last if len(set(last)) == len(last) else list(sweep.labels)
+    labels = _short(sweep.labels)
     shared = [label.removesuffix("_rad") + "_deg" if label.endswith("_rad") else label for label in labels]
     for k, name in enumerate(shared):
         yield ("sigma", name), (_DEG if labels[k].endswith("_rad") else 1.0) * sweep.sigma[:, k]
@@ -79,6 +85,12 @@ def _columns(sweep: Sweep) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
         for k, axis in enumerate(AXES):
             yield (quantity, f"{axis}_m"), values[:, k]
     yield ("sigma0", "block"), sweep.sigma0
+
+
+def _short(labels: Sequence[str]) -> list[str]:
+    """Return the last parts of the labels, or the labels if these are not unique."""
+    last = [label.rpartition("].")[2] for label in labels]
+    return last if len(set(last)) == len(last) else list(labels)
 
 
 def sweep_figure(table: pd.DataFrame, x: str, shown: Sequence[tuple[str, str]], by: Sequence[str] = ()) -> Figure:
@@ -97,7 +109,7 @@ def sweep_figure(table: pd.DataFrame, x: str, shown: Sequence[tuple[str, str]], 
 def plot_sweep(
     table: pd.DataFrame, x: str, quantity: str, of: str, ax: Axes | None = None, *, by: Sequence[str] = ()
 ) -> Axes:
-    """Draw a quantity against the parameter `x`, one line per value of `by`.
+    """Draw a quantity against the parameter `x`, one line per value of `by`; open circles: weakly determined unknowns.
 
     `table` is the table of `sweep_table`, or a subset in which `x` and `by` identify each design. Raises InputError if
     they do not, or for missing columns or quantities.
@@ -117,7 +129,10 @@ def plot_sweep(
     for name, line in rows.groupby(list(by), sort=False) if by else [((), rows)]:
         words = label(", ".join(f"{p} {v}" for p, v in zip(by, name, strict=True)))
         at = line.sort_values(x) if numbers else line
-        ax.plot(at[x] if numbers else at[x].astype(str).map(label), at["value"], "o-", ms=3, lw=1, label=words)
+        places_of = at[x] if numbers else at[x].astype(str).map(label)
+        ax.plot(places_of, at["value"], "o-", ms=3, lw=1, label=words)
+        weak = at["weak"] != ""
+        ax.scatter(places_of[weak], at["value"][weak], 22, "white", edgecolors="black", linewidths=0.8, zorder=3)
     far_apart = lambda v: v.min() > 0 and v.max() / v.min() >= _FAR_APART  # noqa: E731
     if numbers and far_apart(places):
         log_ticks(ax)

@@ -34,20 +34,14 @@ from jaxphoto.statistics import (
 )
 from jaxphoto.statistics.block_geometry import size_mismatches
 from jaxphoto.statistics.correlation import FORMS, high_pairs
+from jaxphoto.statistics.determinability import FELT, WEAK_CORRELATION, corner_yardsticks
 from jaxphoto.unknowns import FIXED, Weighted
 
 HIGH_CORRELATION = 0.9
 HIGH_OWN_CORRELATION = 0.95
-WEAK_CORRELATION = 0.9
 FLAT = 0.2
 """Ratio of height range to flying height below which the ground is nearly flat."""
 NEAR_VERTICAL_DEG = 15.0
-FELT = 10.0
-"""Maximum shift of the image corner by one sigma of an interior parameter, in standard deviations of an image point.
-
-Half of `adjustment.POOR`: the limit of a moderate dilution of precision in GNSS. Well-determined blocks over flat
-ground remain below 8, undetermined ones exceed 15 (benchmarks/defects.py).
-"""
 SEEN = 3.0
 """Ratio of a rolling-shutter readout to its standard deviation above which it is significant."""
 _FOR_POINT = "strips in both directions with stations (GNSS), relief or oblique images"
@@ -224,18 +218,10 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
 
 
 def at_corner(tables: Tables, camera: str) -> dict[str, float]:
-    """Return the shift of the image corner by one sigma of each estimated parameter, in sigmas of an image point.
-
-    c acts along the radius, the principal point directly; coefficients are scaled (`adjustment.yardsticks`).
-    """
+    """Return the shift of the image corner by one sigma of each estimated parameter, in sigmas of an image point."""
     adjusted = tables.adjusted
-    sensor, rows = adjusted.block.sensors[camera], adjusted.block.image_points
-    of_camera = np.isin(adjusted.structure.image, np.flatnonzero(np.array(adjusted.block.image_camera) == camera))
-    measured = float(np.median(np.asarray(rows.sigma)[of_camera])) if of_camera.any() else 1.0
-    tangent = np.hypot(sensor.width_mm, sensor.height_mm) / 2 / float(adjusted.unknowns.interior[camera].c)
-    units = dict(zip(adjusted.structure.labels, yardsticks(adjusted).shared.tolist(), strict=True))
-    units |= {f"interior[{camera}].c_mm": measured / tangent}
-    units |= {f"interior[{camera}].{name}": measured for name in _POINT}
+    labels, own = adjusted.structure.labels, {camera: adjusted.unknowns.interior[camera]}
+    units = dict(zip(labels, corner_yardsticks(adjusted.block, own, labels, yardsticks(adjusted)), strict=True))
     tests = [s for s in tables.significance if s.camera == camera]
     return {s.parameter: s.sigma / units[f"interior[{camera}].{s.parameter}"] for s in tests}
 
