@@ -8,6 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 import pandas as pd
 
+from jaxphoto.camera import table_name
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
 from jaxphoto.report.formatting import without_unit
@@ -116,6 +117,7 @@ def plot_sweep(
     """
     if missing := [column for column in (x, *by) if column not in table]:
         raise InputError(f"the table has no column {missing[0]}: choose among {', '.join(map(str, table.columns))}")
+    of = ":".join(map(table_name, of.split(":")))
     rows = table[(table["quantity"] == quantity) & (table["of"] == of)]
     if rows.empty:
         raise InputError(f"the table has no {quantity} of {of}: look at table[['quantity', 'of']].drop_duplicates()")

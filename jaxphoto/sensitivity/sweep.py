@@ -411,7 +411,8 @@ def _weak(
     """Return the weakly determined unknowns of design `k`."""
     yards = observed_yardsticks(jax.tree.map(lambda v: np.asarray(v)[k], statistics.yards), block, labels)
     corner = corner_yardsticks(block, block.start.unknowns.interior, labels, yards)
-    weak = weakly_determined(labels, sigma, yards, corner, statistics.max_abs[k].max(axis=0))
+    rho = np.asarray(statistics.max_abs)[k].max(axis=0)
+    weak = weakly_determined(labels, sigma, yards, corner, rho)
     return (*weak, "points") if np.sqrt(statistics.point_variance[k]) > POOR * yards.ground else weak
 
 
