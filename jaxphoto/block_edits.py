@@ -93,9 +93,11 @@ class BlockEdits(eqx.Module):
         block: Any = self
         name = one_camera(block, camera)
         require(distortion, AbstractDistortion, "give a model with its coefficients, such as jaxphoto.Brown()")
-        if not is_traced(distortion):
-            distortion.check()
         interior = dataclasses.replace(block.start.unknowns.interior[name], distortion=distortion)
+        if not is_traced(interior):
+            half = np.array([block.sensors[name].width_mm, block.sensors[name].height_mm]) / 2
+            places = half * np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 2), axis=-1).reshape(-1, 2)
+            distortion.check(places / float(interior.c) if distortion.normalised else places)
         others = set(parameter_names(interior)) - set(distortion.coefficients)
         return with_interior(
             block, name, interior, priors_of_camera(interior, block.priors.interior[name], free, others)
