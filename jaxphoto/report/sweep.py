@@ -11,7 +11,7 @@ import pandas as pd
 from jaxphoto.camera import table_name
 from jaxphoto.errors import InputError
 from jaxphoto.observations import AXES
-from jaxphoto.report.formatting import without_unit
+from jaxphoto.report.formatting import head_of, path_words, without_unit
 from jaxphoto.report.plots import axes_or_new, label, log_ticks, new_figure
 from jaxphoto.sensitivity.sweep import Sweep
 
@@ -20,6 +20,11 @@ if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
 _COLUMNS = ("design", "converged", "determined", "weak", "quantity", "of", "value", "unit")
+_QUANTITIES = {
+    "sigma": "sigma of {}", "rms_sigma": "RMS sigma of {}", "rho": "rho of {}", "mean_abs_rho": "mean |rho| of {}",
+    "max_abs_rho": "largest |rho| of {}", "check_sigma": "predicted sigma of {} at check points",
+    "check_rmse": "RMSE of {} at check points", "sigma0": "sigma naught",
+}  # fmt: skip
 _WITH_UNIT = ("sigma", "rms_sigma", "check_sigma", "check_rmse")
 _DEG = 180 / np.pi
 # Ratio of largest to smallest value above which an axis is logarithmic.
@@ -88,6 +93,19 @@ def _columns(sweep: Sweep) -> Iterator[tuple[tuple[str, str], np.ndarray]]:
     yield ("sigma0", "block"), sweep.sigma0
 
 
+def _quantity_words(quantity: str, of: str, unit: str) -> str:
+    """Return a quantity of `sweep_table` in words: "mean |rho| of omega and y_p", "sigma of c [mm]"."""
+    names = (path_words(name) if "]." in name else head_of(name) for name in of.split(":"))
+    text = _QUANTITIES[quantity].format(" and ".join(name.partition(" [")[0] for name in names))
+    return text + f" [{unit}]" * bool(unit)
+
+
+def _value_words(parameter: str, value: object) -> str:
+    """Return a design parameter with its value and unit: "station 0.05 m"."""
+    name, unit = without_unit(parameter)
+    return f"{name.replace('_', ' ')} {value} {unit}".rstrip()
+
+
 def _short(labels: Sequence[str]) -> list[str]:
     """Return the last parts of the labels, or the labels if these are not unique."""
     last = [label.rpartition("].")[2] for label in labels]
@@ -129,7 +147,7 @@ def plot_sweep(
     ax, places = axes_or_new(ax), rows[x].drop_duplicates()
     numbers = pd.api.types.is_numeric_dtype(places) and not pd.api.types.is_bool_dtype(places)
     for name, line in rows.groupby(list(by), sort=False) if by else [((), rows)]:
-        words = label(", ".join(f"{p} {v}" for p, v in zip(by, name, strict=True)))
+        words = label(", ".join(_value_words(p, v) for p, v in zip(by, name, strict=True)))
         at = line.sort_values(x) if numbers else line
         places_of = at[x] if numbers else at[x].astype(str).map(label)
         ax.plot(places_of, at["value"], "o-", ms=3, lw=1, label=words)
@@ -142,9 +160,8 @@ def plot_sweep(
         ax.set_ylim(0, 1.02)
     elif far_apart(rows["value"]):
         ax.set_yscale("log")
-    unit = rows["unit"].iloc[0]
-    ax.set_title(label(f"{quantity} {of}" + f" [{unit}]" * bool(unit)), fontsize=9)
-    ax.set_xlabel(label(x), fontsize=8)
+    ax.set_title(label(_quantity_words(quantity, of, rows["unit"].iloc[0])), fontsize=9)
+    ax.set_xlabel(label(head_of(x)), fontsize=8)
     ax.tick_params(labelsize=7)
     ax.grid(lw=0.3)
     if by:
