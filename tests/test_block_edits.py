@@ -45,7 +45,7 @@ def test_a_parameter_is_fixed_at_a_value():
     held = block.fix("c", value=35.0)
     assert (held.start.unknowns.interior["one"].c, held.priors.interior["one"].c) == (35.0, FIXED)
     assert held.start.unknowns.interior["one"].xp == block.start.unknowns.interior["one"].xp
-    mount, arm = next(iter(block.start.unknowns.mounts)), [0.1, 0.2, 0.3]
+    block, mount, arm = simulated("mount").block, "imu", [0.1, 0.2, 0.3]
     np.testing.assert_array_equal(
         block.fix("lever_arm", value=arm, of=mount).start.unknowns.mounts[mount].lever_arm, arm
     )
@@ -105,7 +105,7 @@ def test_without_images_leaves_the_others_as_they_were():
         (lambda b: b.with_distortion("one", Smac(), free=("k9",)), "no parameter 'k9'; it has c_mm"),
         (lambda b: b.with_camera("one", InteriorOrientation(35.0), free=("a1",)), "no parameter 'a1'"),
         (lambda b: b.fix("c", "k1", value=1.0), "one value for 2 parameters"),
-        (lambda b: b.fix("lever_arm", value=[1.0, 2.0]), "array of the shape"),
+        (lambda b: b.fix("points", value=[1.0, 2.0]), "array of the shape"),
         (lambda b: b.shift_stations(np.zeros((3, 3)), per="strip"), r"shape \(3, 3\); give"),
         (lambda b: b.shift_stations({"z": np.zeros(3)}, per="image"), "unknown image 'z'"),
         (lambda b: b.shift_stations([0.1]), r"give X, Y, Z in metres"),
