@@ -143,7 +143,7 @@ def ours(arguments: argparse.Namespace) -> dict:
                 clock.step("orientation")
             clock.tell(doing)
 
-        interior = InteriorOrientation(start.c, start.x_p, start.y_p, distortion)
+        interior = InteriorOrientation(start.c, start.xp, start.yp, distortion)
         known = KnownOfFlight(
             {p.name: p.gps for p in read},
             {p.name: p.attitude for p in read},

@@ -101,7 +101,7 @@ def write_for_mrcal(path: Path, block: Block, corners: pd.DataFrame) -> None:
     weight = np.where(corners.left_out_by_mrcal == 1, -1.0, corners.weight)
     seen[corners.image.map(place), corners.row, corners.column] = np.stack([corners.x_px, corners.y_px, weight], axis=1)
     f = float(camera.c) / SENSOR.pixel_mm
-    column, row = SENSOR.px_from_mm(np.array([float(camera.x_p), float(camera.y_p)])) - 0.5
+    column, row = SENSOR.px_from_mm(np.array([float(camera.xp), float(camera.yp)])) - 0.5
     lens = camera.distortion
     np.savez(
         path,

@@ -101,8 +101,8 @@ def main(folder: Path) -> None:
     write(stations, folder / "stations.csv", 3)
     truth = {
         "c_mm": TRUTH.c,
-        "xp_mm": TRUTH.x_p,
-        "yp_mm": TRUTH.y_p,
+        "xp_mm": TRUTH.xp,
+        "yp_mm": TRUTH.yp,
         "k1": TRUTH.distortion.k1,
         "k2": TRUTH.distortion.k2,
     }

@@ -17,6 +17,7 @@ from jaxphoto.camera import (
     get_parameter,
     parameter_names,
     set_parameter,
+    table_name,
 )
 from jaxphoto.errors import InputError
 from jaxphoto.short_repr import from_upstairs
@@ -26,14 +27,27 @@ from jaxphoto.unknowns import FIXED, FREE, weighted, with_prior
 class BlockEdits(eqx.Module):
     """Methods of `Block` that return an edited copy."""
 
-    def fix(self, *names: str, of: str | None = None) -> Self:
-        """Return a copy with parameters fixed at their start values: `block.fix("k2")`.
+    def fix(self, *names: str, value: Any = None, of: str | None = None) -> Self:
+        """Return a copy with parameters fixed at their start values, or one parameter fixed at `value` (mm, m, rad).
 
-        Names are the names in tables (`c_mm`, `k1`), fields of mounts and strips (`lever_arm`, `shift`), and
-        `position`, `rotation` (all images) and `points`. `of` names the camera, mount or strip; by default all owners
-        of the parameter. Raises InputError for a parameter that the block does not have, and without a name.
+        `block.fix("k2", "k3")`, `block.fix("lever_arm", value=[0.0, 0.0, 0.8])`. Names are `c` (or `c_mm`, as in
+        tables), `xp`, `yp`, `k1`; fields of mounts and strips (`lever_arm`, `shift`); `position`, `rotation` (all
+        images) and `points`. `of` names the camera, mount or strip; by default all owners of the parameter. `value` may
+        be traced. Raises InputError for a parameter that the block does not have, without a name, and for a value of
+        several parameters or of another shape.
         """
-        return self._with_priors(names, lambda start: FIXED, of)
+        fixed: Any = self._with_priors(names, lambda start: FIXED, of)
+        if value is None:
+            return fixed
+        if len(names) != 1:
+            raise InputError(f"fix: one value for {len(names)} parameters: fix each of them with its own value")
+        (name,), unknowns = names, fixed.start.unknowns
+
+        def valid(start: Any) -> Any:
+            return namespace(value).broadcast_to(weighted(name, start, value, 1.0).value, np.shape(start))
+
+        changed = with_prior(unknowns, name, valid, unknowns, of)
+        return dataclasses.replace(fixed, start=dataclasses.replace(fixed.start, unknowns=changed))
 
     def free(self, *names: str, of: str | None = None) -> Self:
         """Return a copy with free parameters; names as in `fix`."""
@@ -73,15 +87,17 @@ class BlockEdits(eqx.Module):
     def with_distortion(self, camera: str, distortion: AbstractDistortion, free: Collection[str] = ()) -> Self:
         """Return a copy with a new distortion of `camera`: `block.with_distortion("kodak", Smac(), free=("k1", "k2"))`.
 
-        `free` names the estimated coefficients; the others are FIXED, and c_mm, xp_mm and yp_mm retain their priors.
+        `free` names the estimated coefficients; the others are FIXED, and c, xp and yp retain their priors.
         Raises InputError as `with_camera` does, and for a distortion without derivative on the optical axis.
         """
         block: Any = self
         name = one_camera(block, camera)
         require(distortion, AbstractDistortion, "give a model with its coefficients, such as jaxphoto.Brown()")
-        if not is_traced(distortion):
-            distortion.check()
         interior = dataclasses.replace(block.start.unknowns.interior[name], distortion=distortion)
+        if not is_traced(interior):
+            half = np.array([block.sensors[name].width_mm, block.sensors[name].height_mm]) / 2
+            places = half * np.stack(np.meshgrid(*[np.linspace(-1.0, 1.0, 9)] * 2), axis=-1).reshape(-1, 2)
+            distortion.check(places / float(interior.c) if distortion.normalised else places)
         others = set(parameter_names(interior)) - set(distortion.coefficients)
         return with_interior(
             block, name, interior, priors_of_camera(interior, block.priors.interior[name], free, others)
@@ -116,7 +132,7 @@ class BlockEdits(eqx.Module):
         for name in names or ("",):
             if not isinstance(name, str) or not name:
                 asked = f"{name!r} is not a parameter name" if names else "no parameter given"
-                raise InputError(f"{asked}: give names separated by commas, such as c_mm, k1, lever_arm, position")
+                raise InputError(f"{asked}: give names separated by commas, such as c, k1, lever_arm, position")
         for name in names:
             priors = with_prior(priors, name, prior_of, block.start.unknowns, of)
         return dataclasses.replace(block, priors=priors)
@@ -157,7 +173,7 @@ def priors_of_camera(
     for name in others:
         if name in names and name in parameter_names(known):
             priors = set_parameter(priors, name, get_parameter(known, name))
-    for name in free:
+    for name in map(table_name, free):
         if name not in names:
             raise InputError(f"free: the camera has no parameter {name!r}; it has {', '.join(names)}")
         priors = set_parameter(priors, name, FREE)

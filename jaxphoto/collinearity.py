@@ -143,7 +143,7 @@ def camera_residual(
     if interior.rows is not None:
         u, v, w = interior.rows.at_row(xy[1], (u, v, w))
     projection = interior.ideal_from_direction(u, v, w)
-    reduced = jnp.stack([xy[0] - interior.x_p, xy[1] - interior.y_p])
+    reduced = jnp.stack([xy[0] - interior.xp, xy[1] - interior.yp])
     if interior.distortion.domain == "ideal":
         return jnp.stack(_apart(reduced, interior.closed_form(projection)))
     if interior.residuals == "model":

@@ -30,6 +30,7 @@ from jaxphoto.camera import (
     get_parameter,
     parameter_names,
     set_parameter,
+    table_name,
 )
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.errors import InputError
@@ -228,8 +229,6 @@ _WHOLE: dict[str, Callable[[Unknowns], Any]] = {
     "rotation": lambda u: u.exterior.camera_from_object,
     "points": lambda u: u.points,
 }
-# Names of the interior orientation in tables, by their Python names.
-_FIELDS = {"c": "c_mm", "x_p": "xp_mm", "y_p": "yp_mm"}
 
 
 def with_prior(
@@ -237,7 +236,7 @@ def with_prior(
 ) -> Unknowns:
     """Return `priors` with a new prior of the parameter `name`; `prior_of` computes it from the value in `start`.
 
-    Names are the names of the interior orientation (`c_mm` or `c`, `k1` ...), the fields of declared parameters
+    Names are the names of the interior orientation (`c` or `c_mm`, `k1` ...), the fields of declared parameters
     (`lever_arm`, `boresight`, `shift` ...), and `position`, `rotation` and `points` for all images and points. `of` is
     the owner, such as a camera or a strip; by default all owners of the parameter. Raises InputError if no owner has
     it.
@@ -246,7 +245,7 @@ def with_prior(
         raise InputError(f"{name} has one prior for the whole block, not one of {of!r}: omit the owner")
     if name in _WHOLE:
         return eqx.tree_at(_WHOLE[name], priors, prior_of(_WHOLE[name](start)))
-    known, label = [], _FIELDS.get(name, name)
+    known, label = [], table_name(name)
     interior, tables, done = dict(priors.interior), priors.tables, False
     for camera, own in interior.items():
         known += [(camera, one) for one in parameter_names(own)]

@@ -203,7 +203,7 @@ def monte_carlo(
     sigma_deg: Annotated[str | None, Option(help="Standard deviation (degrees) of attitude, boresight.")] = None,
     sigma_mm: Annotated[str | None, Option(help="Standard deviation (mm) of image points.")] = None,
     sigma: Annotated[str | None, Option(help="Standard deviation of the interior parameter.")] = None,
-    parameter: Annotated[str, Option(help="Interior parameter (c_mm, k1 ...) of --bias interior.")] = "",
+    parameter: Annotated[str, Option(help="Interior parameter (c, k1 ...) of --bias interior.")] = "",
     on: Annotated[list[str] | None, Option(help="Only this strip, image, point ... (repeatable).")] = None,
     draws: Annotated[int, Option(help="Number of draws.")] = 1000,
     seed: opt.Seed = 0,

@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from rich.progress import Progress as Bar
 
 COMPILE_NOTE_S = 2.0
-"""Minimum total compile time (s) that is reported at the end."""
+"""Minimum time (s) of waiting for compilations that is reported at the end."""
 # Minimum compile time (s) of a program that is logged.
 _COMPILE_LOG_S = 0.1
 # Name of the records of JAX: a scalar at the start of a compilation, and its duration at the end.
@@ -65,7 +65,7 @@ class Output:
         """Console of the results."""
         self._start, self._warnings, self._files = time.perf_counter(), list[str](), list[str]()
         self._summary, self._compile_s = dict[str, Any](), defaultdict[str, float](float)
-        self._compilations = list[float]()
+        self._compilations, self._waited_s = list[float](), 0.0
         self._log = logging.StreamHandler() if verbose else None
 
     def __enter__(self) -> "Output":
@@ -207,6 +207,10 @@ class Output:
             self._compilations.append(time.perf_counter())
 
     def _compiled(self, event: str, duration_secs: float, **tags: Any) -> None:
+        from jaxphoto.compiling.run import WAITED
+
+        if event == WAITED:
+            self._waited_s += duration_secs
         if event == _COMPILED:
             name = str(tags.get("fun_name", "")).removeprefix("jit(").removesuffix(")").removesuffix("_of_arrays")
             self._compile_s[name] += duration_secs
@@ -217,10 +221,9 @@ class Output:
                 _LOG.info("compiled %s in %.1f s", name, duration_secs)
 
     def _end(self, exit_code: int) -> None:
-        seconds = sum(self._compile_s.values())
         if not self._json:
-            if seconds >= COMPILE_NOTE_S and not self._quiet:
-                typer.echo(f"compilation: {seconds:.1f} s, summed over cores (cached for similar blocks)", err=True)
+            if self._waited_s >= COMPILE_NOTE_S and not self._quiet:
+                typer.echo(f"waited {self._waited_s:.1f} s for compilation (cached for similar blocks)", err=True)
             return
         import jaxphoto
 
@@ -235,7 +238,11 @@ class Output:
             "written": self._files,
             "summary": summary,
             "seconds": time.perf_counter() - self._start,
-            "compiling": {"seconds": seconds, "programs": self._compile_s},
+            "compiling": {
+                "waited_s": self._waited_s,
+                "seconds": sum(self._compile_s.values()),
+                "programs": self._compile_s,
+            },
         }
         # Write arrays as lists, paths as text, and NaN and infinity as null: JSON has neither.
         text = json.dumps(values, default=lambda v: v.tolist() if hasattr(v, "tolist") else str(v))

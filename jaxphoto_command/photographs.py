@@ -127,7 +127,7 @@ def fly(
         flight = calibrate_flight(
             matched.named([p.name for p in read]),
             camera.sensor,
-            InteriorOrientation(initial.c, initial.x_p, initial.y_p, distortion),
+            InteriorOrientation(initial.c, initial.xp, initial.yp, distortion),
             KnownOfFlight(
                 {p.name: p.gps for p in read},
                 {p.name: p.attitude for p in read},
@@ -381,7 +381,7 @@ def orient(
         result = orient(
             [p.name for p in read],
             camera.sensor,
-            InteriorOrientation(initial.c, initial.x_p, initial.y_p, distortion),
+            InteriorOrientation(initial.c, initial.xp, initial.yp, distortion),
             matched.xy_mm,
             matched.pairs,
             matched.sigma_mm,

@@ -198,8 +198,8 @@ def rough(block: Block, truth: Unknowns, seed: int = 2) -> Unknowns:
         priors = block.priors.interior[name]
         camera = InteriorOrientation(
             moved(camera.c, priors.c, 0.2),
-            moved(camera.x_p, priors.x_p, 0.05),
-            moved(camera.y_p, priors.y_p, 0.05),
+            moved(camera.xp, priors.xp, 0.05),
+            moved(camera.yp, priors.yp, 0.05),
             jax.tree.map(lambda v, p: v if p == FIXED else np.float64(0.5 * v), camera.distortion, priors.distortion),
         )
         interior[name] = jax.tree.map(np.float64, camera)

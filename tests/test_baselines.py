@@ -81,7 +81,7 @@ def block_of(npz: Path) -> Block:
 def vector_of(unknowns: Unknowns) -> np.ndarray:
     """The baselines' vector: interior, then angles and position of every image, then points."""
     camera = unknowns.interior["cam"]
-    interior = SIGN * [float(v) for v in (camera.c, camera.x_p, camera.y_p, camera.distortion.k1, camera.distortion.k2)]
+    interior = SIGN * [float(v) for v in (camera.c, camera.xp, camera.yp, camera.distortion.k1, camera.distortion.k2)]
     exterior = np.hstack([np.asarray(unknowns.exterior.omega_phi_kappa), np.asarray(unknowns.exterior.position)])
     return np.concatenate([interior, exterior.ravel(), np.asarray(unknowns.points).ravel()])
 

@@ -35,9 +35,22 @@ def test_another_camera_keeps_priors_by_name_or_takes_those_named():
     block = simulated("cross").block
     interior = InteriorOrientation(36.0, 0.0, 0.0, Smac())
     assert free_of(block.with_camera("one", interior)) == free_of(block)
-    other = block.with_camera("one", interior, free=("c_mm", "p1"), sensor=SENSOR)
+    other = block.with_camera("one", interior, free=("c", "p1"), sensor=SENSOR)
     assert free_of(other) == {"c_mm", "p1"}
     assert other.start.unknowns.interior["one"].c == 36.0 and other.sensors["one"] == SENSOR
+
+
+def test_a_parameter_is_fixed_at_a_value():
+    block = simulated("cross").block
+    held = block.fix("c", value=35.0)
+    assert (held.start.unknowns.interior["one"].c, held.priors.interior["one"].c) == (35.0, FIXED)
+    assert held.start.unknowns.interior["one"].xp == block.start.unknowns.interior["one"].xp
+    block, mount, arm = simulated("mount").block, "imu", [0.1, 0.2, 0.3]
+    np.testing.assert_array_equal(
+        block.fix("lever_arm", value=arm, of=mount).start.unknowns.mounts[mount].lever_arm, arm
+    )
+    slope = jax.jacobian(lambda v: block.fix("lever_arm", value=v).start.unknowns.mounts[mount].lever_arm)(jnp.ones(3))
+    np.testing.assert_array_equal(slope, np.eye(3))
 
 
 def test_shifts_of_stations_by_block_strip_and_image():
@@ -91,6 +104,8 @@ def test_without_images_leaves_the_others_as_they_were():
         (lambda b: b.with_distortion("sony", Smac()), "unknown camera sony"),
         (lambda b: b.with_distortion("one", Smac(), free=("k9",)), "no parameter 'k9'; it has c_mm"),
         (lambda b: b.with_camera("one", InteriorOrientation(35.0), free=("a1",)), "no parameter 'a1'"),
+        (lambda b: b.fix("c", "k1", value=1.0), "one value for 2 parameters"),
+        (lambda b: b.fix("points", value=[1.0, 2.0]), "array of the shape"),
         (lambda b: b.shift_stations(np.zeros((3, 3)), per="strip"), r"shape \(3, 3\); give"),
         (lambda b: b.shift_stations({"z": np.zeros(3)}, per="image"), "unknown image 'z'"),
         (lambda b: b.shift_stations([0.1]), r"give X, Y, Z in metres"),

@@ -139,7 +139,7 @@ def test_priors_are_changed_by_name_and_the_block_stays():
     near = block.weigh("c", 0.02).priors.interior["one"].c
     assert isinstance(near, Weighted)
     assert (near.value, near.sigma) == (block.start.unknowns.interior["one"].c, 0.02)
-    assert block.weigh("x_p", 0.1, value=0.5).priors.interior["one"].x_p.value == 0.5
+    assert block.weigh("xp", 0.1, value=0.5).priors.interior["one"].xp.value == 0.5
     # A weighted parameter can be held, too.
     assert block.weigh("c", 0.02).fix("c_mm").priors.interior["one"].c == FIXED
 
@@ -265,7 +265,7 @@ def test_two_adjustments_of_one_block_are_alike_and_of_another_camera_are_not():
     one = adjusted("cross")
     same = jaxphoto.compare(one, one)
     assert same.chi_square == 0 and not same.beyond.any()
-    moved = dataclasses.replace(one.unknowns.interior["one"], x_p=one.unknowns.interior["one"].x_p + 0.2)
+    moved = dataclasses.replace(one.unknowns.interior["one"], xp=one.unknowns.interior["one"].xp + 0.2)
     unknowns = dataclasses.replace(one.unknowns, interior={"one": moved})
     other = jaxphoto.compare(one, dataclasses.replace(one, unknowns=unknowns), method="zrot")
     (row,) = [p for p in other.parameters if p.parameter == "xp_mm"]
@@ -304,7 +304,7 @@ def test_a_comparison_and_a_simulation_say_what_they_are():
     same = jaxphoto.compare(one, one)
     for shown in (repr(same), same._repr_html_()):
         assert "no significant change of the camera" in shown and "at 0 of 165 points" in shown
-    moved = dataclasses.replace(one.unknowns.interior["one"], x_p=one.unknowns.interior["one"].x_p + 0.2)
+    moved = dataclasses.replace(one.unknowns.interior["one"], xp=one.unknowns.interior["one"].xp + 0.2)
     unknowns = dataclasses.replace(one.unknowns, interior={"one": moved})
     other = jaxphoto.compare(one, dataclasses.replace(one, unknowns=unknowns))
     assert other.changed and "the camera has changed significantly" in other._repr_html_()

@@ -14,6 +14,7 @@ from rich.console import Console
 from rich.progress import Progress as Bar
 
 from jaxphoto.adjustment.iteration_log import log_iterations, step_lines
+from jaxphoto.compiling.run import WAITED
 from jaxphoto_command import app
 from jaxphoto_command import output as output_module
 from jaxphoto_command.output import Output, Progress
@@ -121,9 +122,12 @@ def test_a_compilation_is_noticed_while_it_lasts(monkeypatch):
     assert seen == [False, True, False]
 
 
-def test_a_note_states_a_long_compile_time(capsys):
+def test_a_note_states_a_long_wait_for_compilations(capsys):
     with output() as out:
-        jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 3.0, fun_name="f")
+        # Two programs at the same time.
+        for name in "fg":
+            jax.monitoring.record_event_duration_secs("/jax/core/compile/backend_compile_duration", 3.0, fun_name=name)
+        jax.monitoring.record_event_duration_secs(WAITED, 3.0)
         out.say("done")
     screen = capsys.readouterr()
     assert "3.0 s" in screen.err and screen.out == "done\n"

@@ -132,8 +132,8 @@ def test_what_a_method_leaves_free_makes_no_offset():
 def test_models_of_any_kind_are_compared():
     """One lens in the measured coordinate, with another sign, and in other models that represent it exactly."""
     d = ONE.distortion
-    added = InteriorOrientation(ONE.c, ONE.x_p, ONE.y_p, Smac(k1=-d.k1, k2=-d.k2, k3=-d.k3, sign="add"))
-    brown = InteriorOrientation(ONE.c, ONE.x_p, ONE.y_p, Brown(k1=d.k1, k2=d.k2, k3=d.k3))
+    added = InteriorOrientation(ONE.c, ONE.xp, ONE.yp, Smac(k1=-d.k1, k2=-d.k2, k3=-d.k3, sign="add"))
+    brown = InteriorOrientation(ONE.c, ONE.xp, ONE.yp, Brown(k1=d.k1, k2=d.k2, k3=d.k3))
     assert float(bundle_offsets(added, brown, GRID).rmse_mm) < 1e-12
     in_ideal = bundle_offsets(ONE, InteriorOrientation(2.7, 0.0, 0.0, RadialPolynomial(k1=0.05)), GRID)
     assert bool(in_ideal.converged)

@@ -242,9 +242,9 @@ def test_an_interior_held_takes_the_values_named_and_keeps_the_others():
     camera, *others = block.start.unknowns.interior
     held = hold_interior(block, camera, {"c_mm": 33.3, "yp_mm": -0.4})
     before, after = (b.start.unknowns.interior[camera] for b in (block, held))
-    assert (float(after.c), float(after.y_p)) == (33.3, -0.4)
+    assert (float(after.c), float(after.yp)) == (33.3, -0.4)
     assert jax.tree.leaves(after.distortion) == jax.tree.leaves(before.distortion)
-    assert float(after.x_p) == float(before.x_p)
+    assert float(after.xp) == float(before.xp)
     assert all(prior == FIXED for prior in jax.tree.leaves(held.priors.interior[camera], is_leaf=is_prior))
     assert all(eqx.tree_equal(held.priors.interior[name], block.priors.interior[name]) for name in others)
     assert any(prior != FIXED for prior in jax.tree.leaves(block.priors.interior[camera], is_leaf=is_prior))

@@ -39,7 +39,7 @@ EXPERIMENTS = {"third": lambda block: block, "fourth": conventional}
 def truth_of(simulation: Simulation) -> dict[str, float]:
     """Return the true interior orientation."""
     camera = simulation.truth.interior["kodak"]
-    values = (camera.c, camera.x_p, camera.y_p, camera.distortion.k1, camera.distortion.k2)
+    values = (camera.c, camera.xp, camera.yp, camera.distortion.k1, camera.distortion.k2)
     return dict(zip(IOPS, map(float, values), strict=True))
 
 

@@ -148,7 +148,7 @@ def judged(of: StripPlan, designs: dict[str, StripDesign], draws: int) -> pd.Dat
         errors = []
         for k in range(draws):
             found = jaxphoto.adjust(again(k), truth, sizes=sizes).unknowns.interior["camera"]
-            errors.append(float(found.y_p) - float(truth.interior["camera"].y_p))
+            errors.append(float(found.yp) - float(truth.interior["camera"].yp))
         scatter = np.sqrt(np.mean(np.square(errors))) if draws else np.nan
         rows.append((name, *planned, rho.max(), rho[:, 0, 1].max(), elsewhere, sigma, scatter))
         print(*rows[-1], flush=True)

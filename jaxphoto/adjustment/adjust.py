@@ -11,7 +11,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto.adjustment.arguments import check_arguments
+from jaxphoto.adjustment.arguments import check_arguments, check_residuals
 from jaxphoto.adjustment.datum import close_datum
 from jaxphoto.adjustment.iteration_log import log_iterations
 from jaxphoto.adjustment.layout.padded import PaddedResiduals, PaddedStructure, PaddedValues
@@ -102,6 +102,7 @@ def solve(
     # Concrete arrays, also inside a traced function.
     with jax.ensure_compile_time_eval():
         log_iterations(adjusted)
+        check_residuals(block, adjusted.residuals.named)
         if adjusted.diverged_points.any():
             return dataclasses.replace(adjusted, converged=np.array(False))
         check_rank(adjusted)

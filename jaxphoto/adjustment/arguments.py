@@ -1,11 +1,12 @@
 """Checks of the arguments of an adjustment: types, shapes, finite values."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import Any
 
 import jax
 import numpy as np
 
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError
@@ -28,6 +29,23 @@ def check_arguments(block: Any, start: Any, priors: Any) -> None:
     _check_shapes(block, start)
     for place in _no_numbers(block, start, priors):
         raise InputError(f"{place} is NaN or infinite: give a number, or omit it")
+
+
+def check_residuals(block: Block, residuals: Mapping[str, Any]) -> None:
+    """Raise InputError if a group of observations has NaN or infinite residuals while those of the images are finite.
+
+    Then its own formula is not defined at these unknowns.
+    """
+    if _bad(residuals[IMAGE_POINTS]) is not None:
+        return
+    for group, rows in block.named_observations.items():
+        bad = _bad(residuals.get(group, 0.0))
+        if bad is not None:
+            words = np.broadcast_to(rows.words(block.images, block.points), np.shape(residuals[group]))
+            raise InputError(
+                f"{group}: the residual of {words[bad]} is NaN or infinite: check the formula of "
+                f"{type(rows).__name__}.residual, such as a logarithm, root or quotient outside its domain"
+            )
 
 
 def _check_owners(name: str, tree: Unknowns, known: Unknowns) -> None:

@@ -230,7 +230,7 @@ def check_rank(adjusted: Adjustment) -> None:
     if found := weaknesses_of(adjusted):
         sentences = "; ".join(weakness.sentence for weakness in found)
         points = {p for weakness in found for p in weakness.points} if all(w.points for w in found) else set()
-        raise RankError(f"rank defect, these unknowns are not separable: {sentences}", sorted(points))
+        raise RankError(f"rank defect: {sentences}", sorted(points))
 
 
 @eqx.filter_jit

@@ -13,10 +13,12 @@ gives an undetermined direction a very large, finite standard deviation.
 
 import dataclasses
 import math
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
@@ -28,7 +30,8 @@ from jaxphoto.adjustment.right_hand_sides import at_once, solve_many
 from jaxphoto.adjustment.solver.band import factor_band
 from jaxphoto.adjustment.solver.elimination import FactoredNormal
 from jaxphoto.adjustment.solver.reduced import reduce_normal
-from jaxphoto.arrays import to_numpy
+from jaxphoto.arrays import ArrayLike, to_numpy
+from jaxphoto.block import Block
 from jaxphoto.compiling import call_compiled
 
 POOR = 20.0
@@ -50,9 +53,9 @@ _MOVES = 0.1
 class Yardsticks(NamedTuple):
     """Scales of positions and points (m), rotations (rad), and each shared unknown (its own unit)."""
 
-    ground: float
-    angle: float
-    shared: Float[np.ndarray, "shared"]
+    ground: Float[ArrayLike, ""] | float
+    angle: Float[ArrayLike, ""] | float
+    shared: Float[ArrayLike, "shared"]
 
 
 class MovedUnknowns(NamedTuple):
@@ -105,15 +108,26 @@ class WeakDirection(NamedTuple):
 
 def yardsticks(adjusted: Adjustment) -> Yardsticks:
     """Return the scales of the unknowns of `adjusted`."""
+    scale = image_yardsticks(adjusted.equations.scale)
+    return observed_yardsticks(jax.tree.map(to_numpy, scale), adjusted.block, adjusted.structure.labels)
+
+
+def image_yardsticks(scale: Increments) -> Yardsticks:
+    """Return the changes that move an image point by about its standard deviation; may be traced."""
     # If the optimum does not fit, a camera may be inverted, with negative c and scales.
-    scale, block = jax.tree.map(lambda v: np.abs(to_numpy(v)), adjusted.equations.scale), adjusted.block
-    ground = float(max(scale.eop[:3].max(initial=0.0), scale.points.max(initial=0.0)))
-    angle = float(scale.eop[3:].max(initial=0.0))
+    eop, shared, points = (jnp.abs(v) for v in scale)
+    ground = jnp.maximum(jnp.max(eop[:3], initial=0.0), jnp.max(points, initial=0.0))
+    return Yardsticks(ground, jnp.max(eop[3:], initial=0.0), shared)
+
+
+def observed_yardsticks(scale: Yardsticks, block: Block, labels: Sequence[str]) -> Yardsticks:
+    """Enlarge `image_yardsticks` to the standard deviations of observed positions and attitudes if these are larger."""
+    ground, angle = float(scale.ground), float(scale.angle)
     observed = [float(np.median(to_numpy(rows.sigma))) for rows in (block.stations, block.control) if len(rows)]
     farther = max([1.0, *(sigma / ground for sigma in observed)])
     turned = max(1.0, float(np.median(to_numpy(block.attitudes.sigma))) / angle) if len(block.attitudes) else 1.0
     by_unit = {"m": farther, "s": farther, "m_per_s": farther, "rad": turned, "rad_per_s": turned}
-    factors = [by_unit.get(_unit(label), 1.0) for label in adjusted.structure.labels]
+    factors = [by_unit.get(_unit(label), 1.0) for label in labels]
     return Yardsticks(farther * ground, turned * angle, scale.shared * np.array(factors))
 
 

@@ -152,7 +152,7 @@ class _Words:
             cures.append(f"add control points (point {self._farthest(d)} moves most)")
             if _turns_with_heading(labels):
                 cures.append(_HEADING)
-        return f"{few(labels)}{along}: {_hardly(d)} ({self._sigmas(d)}) and not separable: {_or(cures)}"
+        return f"{few(labels)}{along}: {_hardly(d, len(labels) > 1 or bool(along))} ({self._sigmas(d)}): {_or(cures)}"
 
     def _part(self, d: WeakDirection, labels: list[str], names: list[str]) -> str:
         joint = f" together with {few(labels)}" if labels else ""
@@ -196,7 +196,7 @@ class _Words:
             cures.append(_HEADING)
         elif not labels:
             cures.append("measure more points in these images, or give their stations and attitudes")
-        return f"{what}: {_hardly(d)} ({self._sigmas(d)}) and not separable: {_or(cures)}"
+        return f"{what}: {_hardly(d, bool(labels))} ({self._sigmas(d)}): {_or(cures)}"
 
     def _holding(self, d: WeakDirection, labels: list[str]) -> str:
         """Return the cure: fix one of several unknowns if one suffices, otherwise all."""
@@ -243,7 +243,7 @@ class _Words:
     def _sigmas(self, d: WeakDirection) -> str:
         """Format the motions of the unknowns that participate."""
         if d.sigma > OPEN:
-            return "no observation depends on it"
+            return "no observation depends on this motion"
         moved, yard, found = d.moved, self.yard, []
         if len(d.points):
             found.append(f"points {yard.ground * np.abs(moved.points).max():.2g} m")
@@ -280,8 +280,9 @@ def _turns_with_heading(labels: list[str]) -> bool:
     return ours and not any(label.endswith(("lever_arm_up_m", "c_mm")) for label in labels)
 
 
-def _hardly(d: WeakDirection) -> str:
-    return "not determined" if d.sigma > OPEN else "hardly determined"
+def _hardly(d: WeakDirection, several: bool = False) -> str:
+    """Describe a direction of one unknown, or of `several` that compensate one another."""
+    return f"{'not' if d.sigma > OPEN else 'hardly'} {'separable' if several else 'determined'}"
 
 
 def _and(names: list[str]) -> str:

@@ -14,6 +14,7 @@ from jaxphoto.camera.interior import (
     parameter_names,
     parameter_unit,
     set_parameter,
+    table_name,
 )
 from jaxphoto.camera.principal_points import (
     ConversionError,
@@ -37,5 +38,5 @@ __all__ = [
     "StripCamera", "ThermalRates",
     "constant_names", "conversion_error", "decentring_from_symmetry", "empty_camera", "exact", "get_parameter",
     "invert", "model_keys", "parameter_names", "parameter_unit", "principal_points", "rebalance",
-    "rebalance_covariance", "sensor_keys", "set_parameter", "symmetry_from_decentring", "with_sign",
+    "rebalance_covariance", "sensor_keys", "set_parameter", "symmetry_from_decentring", "table_name", "with_sign",
 ]  # fmt: skip

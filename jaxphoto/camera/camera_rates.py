@@ -33,7 +33,7 @@ class AbstractCameraRates(AbstractParameters):
     along: eqx.AbstractClassVar[str]
     """Name of the independent variable, followed by its unit."""
     owner = "camera"
-    modifies_interior = ("c", "x_p", "y_p", "k1")
+    modifies_interior = ("c", "xp", "yp", "k1")
 
     c_rate: Scalar
     xp_rate: Scalar
@@ -53,8 +53,8 @@ class AbstractCameraRates(AbstractParameters):
         return dataclasses.replace(
             interior,
             c=interior.c + self.c_rate * t,
-            x_p=interior.x_p + self.xp_rate * t,
-            y_p=interior.y_p + self.yp_rate * t,
+            xp=interior.xp + self.xp_rate * t,
+            yp=interior.yp + self.yp_rate * t,
             distortion=distortion,
         )
 

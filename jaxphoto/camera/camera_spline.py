@@ -43,7 +43,7 @@ class CameraSpline(AbstractParameters):
     kind = "camera_splines"
     owner = "camera"
     names = {"c_spline": ("c_mm",), "xp_spline": ("xp_mm",), "yp_spline": ("yp_mm",)}  # noqa: RUF012
-    modifies_interior = ("c", "x_p", "y_p")
+    modifies_interior = ("c", "xp", "yp")
     sized = "knots"
 
     c_spline: Float[Array, "knots *images"]
@@ -69,7 +69,7 @@ class CameraSpline(AbstractParameters):
         """Return the interior orientation at the exposure."""
         weights = self.weights(exposure.in_flight)
         c, x_p, y_p = (jnp.sum(weights * v) for v in (self.c_spline, self.xp_spline, self.yp_spline))
-        return dataclasses.replace(interior, c=interior.c + c, x_p=interior.x_p + x_p, y_p=interior.y_p + y_p)
+        return dataclasses.replace(interior, c=interior.c + c, xp=interior.xp + x_p, yp=interior.yp + y_p)
 
     def weights(self, time: ArrayLike | float) -> Float[ArrayLike, "knots"]:
         """Return the weight of each knot at a time from the middle of the flight (s)."""

@@ -202,7 +202,7 @@ def _plain(
 ) -> InteriorOrientation:
     """Return the camera with the model `target` and the given projection, without distortion."""
     plain = target.plain(sensor)
-    camera = InteriorOrientation(interior.c, interior.x_p, interior.y_p, plain, projection=projection)
+    camera = InteriorOrientation(interior.c, interior.xp, interior.yp, plain, projection=projection)
     return jax.tree.map(lambda v: jnp.asarray(v, float), camera)
 
 

@@ -17,8 +17,7 @@ class Declared(eqx.Module):
 
     `name`: name in files and commands. `coefficients`: fields that an adjustment can estimate. `constants`: fields that
     are never estimated, by their names in files, which end in the unit (`{"r0_mm": "r0"}`). `choices`: static fields
-    with their possible values. `powers`: unit of a coefficient as a power of mm: -2 for mm^-2, 0 if dimensionless; the
-    unit of any other coefficient is unknown in tables.
+    with their possible values. `powers`: unit of each coefficient as a power of mm: -2 for mm^-2, 0 if dimensionless.
 
     Defining a class registers it; a second definition with the same name replaces the first, as when a notebook cell is
     re-run.
@@ -91,6 +90,11 @@ def _check(cls: type[Declared]) -> None:
         raise InputError(
             f"{cls.__qualname__}: the field {', '.join(silent)} is not declared; name it in coefficients, constants "
             "or choices"
+        )
+    if missing := [name for name in cls.coefficients if cls.power(name) is None]:
+        raise InputError(
+            f"{cls.__qualname__}: the unit of {', '.join(missing)} is not declared; give its power of mm in powers "
+            f'(such as powers = {{"{missing[0]}": -2}} for mm^-2, 0 if dimensionless)'
         )
     if strange := [name for name in cls.powers if name not in cls.coefficients]:
         raise InputError(f"{cls.__qualname__}: {', '.join(strange)} in powers is not a coefficient; correct it")

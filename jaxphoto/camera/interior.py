@@ -32,8 +32,8 @@ class InteriorOrientation(eqx.Module):
     """
 
     c: Float[Array, ""] | float
-    x_p: Float[Array, ""] | float = 0.0
-    y_p: Float[Array, ""] | float = 0.0
+    xp: Float[Array, ""] | float = 0.0
+    yp: Float[Array, ""] | float = 0.0
     distortion: AbstractDistortion = dataclasses.field(default_factory=Brown)
     residuals: Literal["model", "measured"] = eqx.field(static=True, default="measured")
     projection: AbstractProjection = dataclasses.field(default_factory=Perspective)
@@ -96,7 +96,7 @@ class InteriorOrientation(eqx.Module):
     @property
     def principal_point(self) -> Float[Array, "2"]:
         """Return (x_p, y_p) in mm."""
-        return jnp.stack([jnp.asarray(self.x_p), jnp.asarray(self.y_p)])
+        return jnp.stack([jnp.asarray(self.xp), jnp.asarray(self.yp)])
 
     def _in_mm(self, of_model: Callable, xy: Float[Array, "2"]) -> Float[Array, "2"]:
         """Convert a mapping of the distortion from its own unit to millimetres."""
@@ -176,10 +176,21 @@ def set_parameter(interior: InteriorOrientation, name: str, value) -> InteriorOr
     return eqx.tree_at(where, interior, value)
 
 
-_FIELDS = {"c_mm": "c", "xp_mm": "x_p", "yp_mm": "y_p"}
+_FIELDS = {"c_mm": "c", "xp_mm": "xp", "yp_mm": "yp"}
+_TABLE_NAMES = {field: name for name, field in _FIELDS.items()} | {"x_p": "xp_mm", "y_p": "yp_mm"}
+
+
+def table_name(name: str) -> str:
+    """Return the name of a parameter in files and tables: c_mm for c, xp_mm for xp; other names are unchanged.
+
+    Also accepts a path, such as `interior[kodak].c`.
+    """
+    path, dot, last = name.rpartition("].")
+    return path + dot + _TABLE_NAMES.get(last, last)
 
 
 def _place(interior: InteriorOrientation, name: str) -> tuple[object, str]:
+    name = table_name(name)
     if name in _FIELDS:
         return interior, _FIELDS[name]
     for part in (interior.distortion, interior.projection):

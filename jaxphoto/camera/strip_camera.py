@@ -22,7 +22,7 @@ class StripCamera(AbstractParameters):
     kind = "strip_cameras"
     owner = "strip"
     names = {"c_more": ("c_more_mm",), "xp_more": ("xp_more_mm",), "yp_more": ("yp_more_mm",)}  # noqa: RUF012
-    modifies_interior = ("c", "x_p", "y_p")
+    modifies_interior = ("c", "xp", "yp")
 
     c_more: Scalar
     xp_more: Scalar
@@ -33,6 +33,6 @@ class StripCamera(AbstractParameters):
         return dataclasses.replace(
             interior,
             c=interior.c + self.c_more,
-            x_p=interior.x_p + self.xp_more,
-            y_p=interior.y_p + self.yp_more,
+            xp=interior.xp + self.xp_more,
+            yp=interior.yp + self.yp_more,
         )

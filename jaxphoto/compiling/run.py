@@ -14,10 +14,11 @@ from typing import Any, NamedTuple
 
 import equinox as eqx
 import jax
+import jax.monitoring
 
 from jaxphoto.compiling import store
 from jaxphoto.compiling.freed_memory import keep_freed_memory, return_freed_memory
-from jaxphoto.compiling.options import options_here
+from jaxphoto.compiling.options import Options, options_here
 from jaxphoto.compiling.plain_tree import Slot
 
 
@@ -36,6 +37,8 @@ class _Program(NamedTuple):
         return jax.tree.unflatten(self.structure, leaves)
 
 
+WAITED = "/jaxphoto/compile_wait_duration"
+"""Record of JAX's monitoring: time that a caller waited for the compilation of a program, in seconds."""
 # Maximum number of programs cached by a process; then the least recently used is dropped. A large program uses 300 of
 # the 65,530 memory mappings that Linux gives a process; a process without free mappings crashes.
 MOST = 100
@@ -60,12 +63,13 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
         return function(*arguments)
     key, arrays = found
     prepared, program = _prepared.pop(key, None), _programs.pop(key, None)
+    new = program is None
     if prepared is not None:
         program = prepared.result()
     elif program is None:
         program = _program_of(function.__wrapped__, arguments, thorough)()
     if program is None:
-        program = _compilation_of(function.__wrapped__, arguments, thorough)()
+        program = _recompiled(function.__wrapped__, arguments, thorough)
     _keep(key, program)
     ready = time.perf_counter()
     try:
@@ -74,10 +78,12 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
         # A valid file may still fail on this machine: this appears only in the call, as various errors.
         if not program.loaded:
             raise
-        program = _compilation_of(function.__wrapped__, arguments, thorough)()
+        program = _recompiled(function.__wrapped__, arguments, thorough)
         _keep(key, program)
         ready = time.perf_counter()
         result = program(arrays)
+    if new and not program.loaded:
+        jax.monitoring.record_event_duration_secs(WAITED, ready - began)
     seconds["compile"] = seconds.get("compile", 0.0) + ready - began
     seconds[name] = seconds.get(name, 0.0) + time.perf_counter() - ready
     return result
@@ -146,10 +152,11 @@ def _program_of(function: Any, arguments: tuple, thorough: bool) -> Callable[[],
 
     All steps that depend on the thread, such as `with jax.enable_x64(False)`, are completed before this returns.
     """
-    key = store.key_of(function, arguments, options_here(thorough))
+    options = options_here(thorough)
+    key = store.key_of(function, arguments, options)
     content = store.read(key) if key else None
     if content is None:
-        return _compilation_of(function, arguments, thorough)
+        return _compilation_of(function, arguments, options, key)
 
     def loaded() -> _Program | None:
         stored = store.load(content)
@@ -159,10 +166,16 @@ def _program_of(function: Any, arguments: tuple, thorough: bool) -> Callable[[],
     return loaded
 
 
-def _compilation_of(function: Any, arguments: tuple, thorough: bool) -> Callable[[], _Program]:
-    """Return a function that compiles and stores the program."""
+def _recompiled(function: Any, arguments: tuple, thorough: bool) -> _Program:
+    """Compile and store a program whose file is invalid."""
     options = options_here(thorough)
-    key = store.key_of(function, arguments, options)
+    return _compilation_of(function, arguments, options, store.key_of(function, arguments, options))()
+
+
+def _compilation_of(
+    function: Any, arguments: tuple, options: Options | None, key: str | None
+) -> Callable[[], _Program]:
+    """Return a function that compiles the program and stores it as `key`."""
     lowered, skeleton = _lowered(function, arguments)
 
     def compiled() -> _Program:

@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.arrays import ArrayLike
+from jaxphoto.camera import table_name
 from jaxphoto.errors import camera_words, few
 from jaxphoto.observations.base import AXES, AbstractObservations, ImageState, index_of
 from jaxphoto.rotation import small_angles
@@ -105,7 +106,8 @@ class KnownParameters(eqx.Module):
         covariance: Float[ArrayLike, "n n"],
         reservation: str = "",
     ):
-        self.labels, self.value, self.covariance, self.reservation = tuple(labels), value, covariance, reservation
+        self.labels = tuple(map(table_name, labels))
+        self.value, self.covariance, self.reservation = value, covariance, reservation
         n = len(self.labels)
         if np.shape(value) != (n,) or np.shape(covariance) != (n, n):
             raise ValueError(

@@ -21,7 +21,7 @@ from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, 
 from jaxphoto.report.plots import axes_or_new, label
 from jaxphoto.report.results import rounded, write_results, write_study
 from jaxphoto.report.tables import Tables, about_sigma, initial_values
-from jaxphoto.report.terminal import plain, print_lines
+from jaxphoto.report.terminal import headline, plain, print_lines
 from jaxphoto.report.verdict import verdict_of
 from jaxphoto.statistics import chi_square_p
 from jaxphoto.writing import whole_folder
@@ -198,8 +198,7 @@ def print_boresight(steps: Sequence[Step], console: Console) -> None:
     """Print the verdict, sigma naught and test of each step, the estimates, and the findings of each step."""
     console.print(plain(steps[0].adjusted.block.title or "block"), style="bold")
     colour = _colour(steps)
-    style = f"bold {colour.replace('amber', 'yellow')}"
-    console.print(f"{colour}: {boresight_verdict(steps)}", style=style, soft_wrap=True)
+    console.print(headline(f"{colour}: {boresight_verdict(steps)}", colour), soft_wrap=True)
     console.print(to_rich(tests_table(steps), "steps"))
     console.print(to_rich(estimates(steps), f"estimates of step {_result(steps).number} (a posteriori)"))
     if len(table := differences(steps)):

@@ -18,7 +18,7 @@ from jaxphoto.georeferencing import TrajectoryKnot
 from jaxphoto.observations import AXES
 from jaxphoto.report.formatting import column_unit, path_words, to_rich
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, page, provenance
-from jaxphoto.report.plots import axes_or_new, label
+from jaxphoto.report.plots import axes_or_new, colour_bar, label
 from jaxphoto.report.results import assumed_pixels
 from jaxphoto.report.terminal import plain
 from jaxphoto.sensitivity import Draws
@@ -143,7 +143,7 @@ def plot_effects(
     )
     ax.set_xticks(range(len(names)), columns, rotation=45, ha="right", fontsize=8)
     ax.set_yticks(range(len(effects)), rows, fontsize=7)
-    ax.figure.colorbar(image, ax=ax, label="effect of one sigma / predicted sigma")
+    colour_bar(ax, image, "effect of one sigma / predicted sigma")
     return ax
 
 

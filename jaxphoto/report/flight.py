@@ -43,7 +43,7 @@ from jaxphoto.report.photographs import (
     surveyed_points,
     write_control,
 )
-from jaxphoto.report.plots import axes_or_new, label, plot_links, title
+from jaxphoto.report.plots import arrow_key, axes_or_new, label, plot_links, title
 from jaxphoto.report.residual_findings import component_findings, component_tables
 from jaxphoto.report.results import adjustment_sections, coverage_words, summary_table, write_results, write_summary
 from jaxphoto.report.tables import Tables, estimates_table, with_correlated_sigma
@@ -317,7 +317,7 @@ def plot_position_offsets(report: PartReport, ax: Axes | None = None) -> Axes:
         for rows, colour, name in ((has & ~used, "tab:red", "rejected"), (used, "tab:blue", "used")):
             style = {"angles": "xy", "scale_units": "xy", "scale": scale, "color": colour, "width": 0.005}
             arrows = ax.quiver(*station[rows].T, *d[rows].T, label=name, **style)
-        ax.quiverkey(arrows, 0.75, 1.04, size, f"{size:g} m", labelpos="E")
+        arrow_key(ax, arrows, size, f"{size:g} m")
         ax.legend(fontsize=7)
         largest = np.argsort(-np.where(has, np.hypot(*np.nan_to_num(d).T), -1.0))
         for k in largest[: min(_NAMED, has.sum())]:

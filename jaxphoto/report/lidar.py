@@ -20,7 +20,7 @@ from jaxphoto.procedures.lidar.vertical_control import flag_counts
 from jaxphoto.report.findings import Verdict, as_sentence
 from jaxphoto.report.formatting import in_figures, label_unit, to_rich, without_empty
 from jaxphoto.report.page import CommandRecord, Heading, Link, Paragraph, Part, Plot, page, provenance, verdict_parts
-from jaxphoto.report.plots import axes_or_new, title
+from jaxphoto.report.plots import axes_or_new, colour_bar, title
 from jaxphoto.report.results import summary_of, write_results, write_study
 from jaxphoto.report.tables import Tables, about_sigma, estimates_table
 from jaxphoto.report.terminal import plain, print_lines, print_sigma0, print_verdict
@@ -33,6 +33,8 @@ if TYPE_CHECKING:
 
 ITERATIONS = {"round": "iteration", "observed": "observations", "left_out": "rejected", "moved_m": "rms_motion_m"}
 """Heads of the columns of iterations on a page."""
+_AXES = ("X, omega", "Y, phi", "Z, kappa")
+_CHANGES = "RMS changes; images and points relative to the adjustment without the cloud, with fixed initial cameras"
 # Maximum number of rows of a long table on a page.
 _ROWS = 30
 
@@ -107,11 +109,11 @@ def _estimates(moved: pd.DataFrame) -> pd.DataFrame:
 
 
 def _root_mean_squares(moved: pd.DataFrame) -> pd.DataFrame:
-    """Return the RMS changes of `moved_table` by group as text: change of, X, Y, Z, unit."""
+    """Return the RMS changes of `moved_table` by group as text, one column for each axis and its rotation."""
     rows = moved[moved["before"].isna()]
-    group = rows["what"].str.partition(",")[0].replace("images", "omega, phi, kappa")
+    group = rows["what"].str.partition(",")[0].replace("images", "rotations")
     return pd.DataFrame([
-        {"RMS change of": name, **dict(zip(AXES, (in_figures(v, 3) for v in of["moved"]), strict=True)), "unit": unit}
+        {"RMS change of": name, **dict(zip(_AXES, (in_figures(v, 3) for v in of["moved"]), strict=True)), "unit": unit}
         for (name, unit), of in rows.groupby([group, "unit"], sort=False)
     ])  # fmt: skip
 
@@ -168,7 +170,7 @@ def _draw_heights(axes: Axes, points: np.ndarray, values: np.ndarray, words: str
     limit = float(np.nanpercentile(np.abs(values), 95)) or 1.0
     colours: dict[str, Any] = {"c": values, "cmap": "RdBu_r", "vmin": -limit, "vmax": limit}
     shown = axes.scatter(points[:, 0], points[:, 1], s=18, edgecolor="0.6", **colours)
-    axes.figure.colorbar(shown, ax=axes, label=words, shrink=0.8)
+    colour_bar(axes, shown, words)
     axes.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
     axes.ticklabel_format(useOffset=False, style="plain")
     title(axes, name)
@@ -196,7 +198,8 @@ def write_simultaneous(
             Heading("Points and surface of the cloud"),
             [Plot(partial(plot_above, result, before=b), f"points above the cloud {w}", 4)
              for b, w in ((True, "before"), (False, "after"))],
-            _root_mean_squares(moved), Heading("Iterations"), rounds.replace(np.inf, np.nan).rename(columns=ITERATIONS),
+            Paragraph(as_sentence(_CHANGES)), _root_mean_squares(moved),
+            Heading("Iterations"), rounds.replace(np.inf, np.nan).rename(columns=ITERATIONS),
             Heading("Correlations of the scanner"),
             Paragraph("The strongest; all are in scanner_correlation.csv."), _strongest(correlations),
         ]  # fmt: skip
@@ -223,7 +226,7 @@ def print_simultaneous(result: Simultaneous, tables: Tables, verdict: Verdict, c
     print_lines(rounds_words(result.rounds, result.converged), console)
     moved = moved_table(result, tables)
     console.print(to_rich(_estimates(moved), "estimates (a posteriori)"))
-    console.print(to_rich(_root_mean_squares(moved)))
+    console.print(to_rich(_root_mean_squares(moved), _CHANGES))
 
 
 def print_control(control: LidarControl | RoofControl, start: Unknowns, console: Console) -> None:

@@ -163,12 +163,10 @@ def html(part: Part) -> Markup:
     if isinstance(part, Folded):
         inside = Markup("").join(map(html, part.parts))
         return Markup("<details><summary>{}</summary>{}</details>").format(part.text, inside)
-    matrix = isinstance(part, Matrix)
-    table = part.table if isinstance(part, Matrix) else part
+    table, caption, matrix = (part.table, part.caption, True) if isinstance(part, Matrix) else (part, "", False)
     shown, numeric = (_two_places(table) if matrix else readable(table)), numeric_columns(table)
     numbers = [number or _mostly_numbers(shown.iloc[:, k]) for k, number in enumerate(numeric)]
     columns = [_aligned(shown.iloc[:, k]) if number else list(shown.iloc[:, k]) for k, number in enumerate(numbers)]
-    matrix = isinstance(part, Matrix)
     styles = [
         _backgrounds(table.iloc[:, k]) if matrix and number else [""] * len(table) for k, number in enumerate(numeric)
     ]
@@ -176,7 +174,7 @@ def html(part: Part) -> Markup:
     return Markup(
         _TEMPLATES.get_template("table.html").render(
             heads=[head_of(str(name)) for name in table.columns], rows=list(zip(*cells, strict=True)),
-            caption=part.caption if isinstance(part, Matrix) else "",
+            caption=caption,
             style="matrix" if matrix else "texts" if any(len(c) > _LONG for column in columns for c in column) else "",
             kinds=["number" if number else "text" for number in numbers],
         )

@@ -25,7 +25,9 @@ from jaxphoto.statistics.sigma_map import SigmaMap, sigma_map
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
+    from matplotlib.cm import ScalarMappable
     from matplotlib.figure import Figure
+    from matplotlib.quiver import Quiver
 
 _COLOURS = ("tab:blue", "tab:orange", "tab:green")
 # Maximum number of points of a Q-Q plot.
@@ -84,6 +86,16 @@ def log_ticks(axes: Axes) -> None:
     axes.xaxis.set_minor_formatter("")
 
 
+def colour_bar(axes: Axes, drawn: ScalarMappable, name: str = "") -> None:
+    """Draw the colour bar of `drawn` to the right of a panel, as tall as the panel also with equal aspect."""
+    axes.figure.colorbar(drawn, cax=axes.inset_axes((1.03, 0.0, 0.04, 1.0)), label=name)
+
+
+def arrow_key(axes: Axes, arrows: Quiver, size: float, text: str) -> None:
+    """Draw an arrow of `size` with its label above the right end of a panel."""
+    axes.quiverkey(arrows, 0.94, 1.05, size, text, labelpos="W", labelsep=0.05, fontproperties={"size": 7.5})
+
+
 def draw_format(axes: Axes, sensor: Sensor) -> None:
     """Draw the outline of the image format; axes in millimetres from its centre."""
     w, h = sensor.width_mm / 2, sensor.height_mm / 2
@@ -97,7 +109,7 @@ def draw_format_map(
     """Draw a colour map over the image format with the title `name`."""
     if np.ptp(values) > 1e-9 * max(np.abs(values).max(), 1e-300):
         filled = axes.tricontourf(cells_mm[:, 0], cells_mm[:, 1], values, levels=12, cmap="cividis")
-        axes.figure.colorbar(filled, ax=axes, shrink=0.85)
+        colour_bar(axes, filled)
     else:
         axes.text(0, 0, f"{values.mean():.3g} everywhere", ha="center", fontsize=8)
     draw_format(axes, sensor)
@@ -120,7 +132,7 @@ def draw_matrix(axes: Axes, values: np.ndarray, rows: Sequence[str], columns: Se
 def draw_arrows(axes: Axes, at: np.ndarray, v: np.ndarray, key: float, length: float, text: str) -> None:
     """Draw arrows `v` at `at` (2 x n). The key is an arrow of size `key`, drawn length `length` and label `text`."""
     arrows = axes.quiver(*at, *v, angles="xy", scale_units="xy", scale=key / length, width=0.004, color="tab:blue")
-    axes.quiverkey(arrows, 0.94, 1.05, key, text, labelpos="W", labelsep=0.05, fontproperties={"size": 7.5})
+    arrow_key(axes, arrows, key, text)
     axes.update_datalim((at + v * length / key).T)
     axes.autoscale_view()
 
@@ -453,7 +465,7 @@ def plot_error_ellipses(tables: Tables, ax: Axes | None = None) -> Axes:
         reach = factor * major[:, None] * np.ones(2)
         ax.update_datalim(np.concatenate([at[known, :2] - reach, at[known, :2] + reach]))
         ax.autoscale_view()
-        ax.figure.colorbar(ellipses, ax=ax, shrink=0.8, label=f"sigma of Z [{unit}]")
+        colour_bar(ax, ellipses, f"sigma of Z [{unit}]")
         name = f"error ellipses x {factor:,.0f}, largest {major.max():.2g} {unit}"
     ax.set(xlabel=f"X [{unit}]", ylabel=f"Y [{unit}]")
     title(ax, name)
@@ -476,7 +488,7 @@ def plot_overlap(tables: Tables, ax: Axes | None = None) -> Axes:
     counts = np.ma.masked_less(cover.seen_by, 1)
     (x0, x1), (y0, y1) = ((v[0] - cover.step_m / 2, v[-1] + cover.step_m / 2) for v in (cover.x, cover.y))
     shown = ax.imshow(counts, cmap="viridis", origin="lower", extent=(x0, x1, y0, y1))
-    ax.figure.colorbar(shown, ax=ax, label="images", shrink=0.8)
+    colour_bar(ax, shown, "images")
     station = np.asarray(tables.adjusted.unknowns.exterior.position)
     ax.plot(station[:, 0], station[:, 1], "w+", ms=5, mew=0.8)
     ax.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
@@ -493,7 +505,7 @@ def plot_links(tables: Tables, ax: Axes | None = None) -> Axes:
     ends = np.stack([station[links.first], station[links.second]], axis=1)[order]
     drawn = LineCollection(list(ends), array=links.common[order], cmap="cividis_r", lw=0.8, rasterized=len(ends) > 2000)
     ax.add_collection(drawn)
-    ax.figure.colorbar(drawn, ax=ax, shrink=0.8, label="common points")
+    colour_bar(ax, drawn, "common points")
     ax.plot(*station.T, "o", ms=3, color="tab:blue")
     ax.set(xlabel=f"X [{unit}]", ylabel=f"Y [{unit}]")
     title(ax, f"{len(ends)} pairs of images with common points")

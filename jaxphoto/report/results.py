@@ -31,6 +31,7 @@ from jaxphoto.report.formatting import (
     symbol,
     with_sigma,
     without_empty,
+    without_powers,
     write_table,
 )
 from jaxphoto.report.page import (
@@ -234,7 +235,14 @@ def report_page(
         fact = [text.removesuffix(f". {hint}") for text, hint in zip(table["text"], table["hint"], strict=True)]
         units = [f.numbers.get("unit", "") for f in verdict.findings[_TOP:]]
         columns = ["severity", "code", "value", "limit", "unit", "finding", "hint"]
-        parts += [Heading("Further findings"), without_empty(table.assign(finding=fact, unit=units)[columns])]
+        # One by one: a column has counts, probabilities and standard deviations.
+        numbers = {
+            name: ["" if pd.isna(v) else without_powers(f"{v:.4g}") for v in table[name]] for name in ("value", "limit")
+        }
+        parts += [
+            Heading("Further findings"),
+            without_empty(table.assign(finding=fact, unit=units, **numbers)[columns]),
+        ]
     parts += adjustment_sections(tables, factor=factor)
     if record:
         parts += provenance(record)

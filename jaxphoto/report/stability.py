@@ -12,17 +12,17 @@ import pandas as pd
 from rich.console import Console
 
 from jaxphoto.camera import InteriorOrientation, Sensor
-from jaxphoto.errors import camera_words
+from jaxphoto.errors import camera_words, counted
 from jaxphoto.procedures.compare import Halves
 from jaxphoto.report.findings import as_sentence, p_words
-from jaxphoto.report.formatting import in_figures, of_p, of_sigma, to_rich, with_sigma, without_empty
+from jaxphoto.report.formatting import in_figures, of_p, of_sigma, symbol, to_rich, with_sigma, without_empty
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot
-from jaxphoto.report.plots import axes_or_new, draw_format, draw_format_map, title
+from jaxphoto.report.plots import arrow_key, axes_or_new, colour_bar, draw_format, draw_format_map, title
 from jaxphoto.report.results import assumed_pixel_words, assumed_pixels, write_study
 from jaxphoto.report.tables import Tables, estimates_table
-from jaxphoto.report.terminal import plain, print_lines, print_sigma0
+from jaxphoto.report.terminal import headline, plain, print_lines, print_sigma0
 from jaxphoto.stability import ALIGNED, LEVEL, Analysis, Change, Method
-from jaxphoto.stability.comparison import change_meaning
+from jaxphoto.stability.comparison import SIGNIFICANT_P, change_meaning
 from jaxphoto.writing import whole_folder
 
 if TYPE_CHECKING:
@@ -116,10 +116,10 @@ def plot_ray_offsets(analysis: Analysis, sensor: Sensor, ax: Axes | None = None)
     if size.max() > 0:
         colours: dict[str, Any] = {"levels": 12, "cmap": "YlGnBu", "vmin": 0.0, "vmax": _LIGHT * size.max()}
         filled = ax.tricontourf(points[:, 0], points[:, 1], size, **colours)
-        ax.figure.colorbar(filled, ax=ax, label="offset of corresponding rays [µm]", shrink=0.85)
+        colour_bar(ax, filled, "offset of corresponding rays [µm]")
     arrows = ax.quiver(*points.T, *v.T, angles="xy", color="0.15", width=0.0025)
     key = float(f"{max(size.mean(), 1e-12):.0e}")
-    ax.quiverkey(arrows, 0.86, 1.03, key, f"{key:g} µm", labelpos="E")
+    arrow_key(ax, arrows, key, f"{key:g} µm")
     draw_format(ax, sensor)
     title(ax, f"{analysis.method}: RMSE_offset {1e3 * float(analysis.offsets.rmse_mm):.3g} µm")
     return ax
@@ -130,9 +130,8 @@ def print_stability(
     method: Method, console: Console,
 ) -> None:  # fmt: skip
     """Print the verdict by `method`, one column per method, and both calibrations."""
-    colour = "green" if analyses[method].similar(noise_mm) else "yellow"
-    verdict = f"{method}: {analyses[method].verdict(noise_mm)}"
-    console.print(verdict, style=f"bold {colour}", highlight=False, markup=False, soft_wrap=True)
+    colour = "green" if analyses[method].similar(noise_mm) else "amber"
+    console.print(headline(f"{method}: {analyses[method].verdict(noise_mm)}", colour), soft_wrap=True)
     name = f"stability; noise {1e3 * noise_mm:.4g} um = {noise_mm / pixel_mm:.4g} px"
     console.print(to_rich(by_method(analyses, pixel_mm, noise_mm), name))
     print_lines(about_sets(sets), console)
@@ -214,6 +213,13 @@ def change_verdict(change: Change, sensor: Sensor) -> list[str]:
         )
     elif not change.parameters:
         sentences.append("parameters are not compared: the calibrations have different models")
+    if tested := [one for one in change.parameters if one.sigma > 0]:
+        least, limit = min(tested, key=lambda one: one.p_value), SIGNIFICANT_P / len(tested)
+        sentences.append(
+            f"single parameters: smallest {p_words(least.p_value, 2)} ({symbol(least.parameter)}), "
+            f"{'' if least.p_value < limit else 'not '}significant: the limit for {counted(len(tested), 'test')} is "
+            f"{limit:.2g} (Bonferroni)"
+        )
     if held := [one.parameter for one in change.parameters if one.sigma == 0 and one.difference != 0]:
         sentences.append(f"fixed at different values and not tested: {', '.join(held)}")
     field = change.field.uncertainty
@@ -249,7 +255,7 @@ def plot_change(change: Change, sensor: Sensor, ax: Axes | None = None, *, over_
 
 def print_change(change: Change, sets: tuple[Compared, Compared], sensor: Sensor, console: Console) -> None:
     """Print the verdict, the parameters, the tests and both calibrations."""
-    console.print(change_headline(change), style=f"bold {'yellow' if change.changed else 'green'}", soft_wrap=True)
+    console.print(headline(change_headline(change), "amber" if change.changed else "green"), soft_wrap=True)
     table = parameter_changes(change).drop(columns="ratio")
     if len(table := table[(table["sigma"] > 0) | (table["first"] != 0) | (table["second"] != 0)]):
         console.print(to_rich(table.rename(columns={"first": "A", "second": "B", "difference": "B - A"})))
@@ -375,8 +381,7 @@ def print_halves(halves: Halves, console: Console) -> None:
     """Print the verdict, sigma naught and the estimates with their enlarged standard deviations."""
     verdict = halves_verdict(halves)
     console.print(plain(halves.adjusted.block.title or "block"), style="bold")
-    colour = {"amber": "yellow"}.get(_colour(halves), "green")
-    console.print(plain(verdict[0]), style=f"bold {colour}", soft_wrap=True)
+    console.print(headline(verdict[0], _colour(halves)), soft_wrap=True)
     print_sigma0(halves.adjusted, console)
     console.print(to_rich(_estimates(halves), f"estimates ({_factor_words(halves)})"))
     print_lines(verdict[1:], console)

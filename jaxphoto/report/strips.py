@@ -23,7 +23,7 @@ from jaxphoto.report.findings import Finding, Severity, Verdict, as_sentence, p_
 from jaxphoto.report.formatting import label_unit, to_rich
 from jaxphoto.report.lidar import ITERATIONS
 from jaxphoto.report.page import CommandRecord, Heading, Paragraph, Part, Plot, verdict_parts
-from jaxphoto.report.plots import axes_or_new, draw_matrix, label, title
+from jaxphoto.report.plots import axes_or_new, colour_bar, draw_matrix, label, title
 from jaxphoto.report.results import write_results, write_study
 from jaxphoto.report.tables import Tables, about_sigma, initial_values
 from jaxphoto.report.terminal import print_lines, print_sigma0, print_verdict
@@ -235,7 +235,7 @@ def plot_strip_differences(gaps: Raster, ax: Axes | None = None, *, limit_m: flo
     ax, limit = axes_or_new(ax), 100 * (_limit(gaps) if limit_m is None else limit_m)
     (west, south), (east, north) = gaps.extent
     shown = ax.imshow(100 * gaps.heights, extent=(west, east, south, north), cmap="RdBu_r", vmin=-limit, vmax=limit)
-    ax.figure.colorbar(shown, ax=ax, label="later strip above earlier [cm]", shrink=0.8)
+    colour_bar(ax, shown, "later strip above earlier [cm]")
     title(ax, f"{100 * float(np.sqrt(np.nanmean(gaps.heights**2))):.2g} cm RMS")
     ax.set(xlabel="X [m]", ylabel="Y [m]", aspect="equal")
     ax.ticklabel_format(useOffset=False, style="plain")

@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Mapping
 from functools import cached_property
-from operator import attrgetter
 from typing import Any
 
 import equinox as eqx
@@ -317,7 +316,11 @@ class Tables:
     def residual_spread(self) -> pd.DataFrame:
         """Spread of the residuals: group, axis, n, mean, rmse, max_abs, unit (paper 000, Table 3)."""
         columns = ["group", "axis", "n", "mean", "rmse", "max_abs", "unit"]
-        return pd.DataFrame(map(attrgetter(*columns), statistics.residual_spread(self.adjusted)), columns=columns)
+        rows = []
+        for s in statistics.residual_spread(self.adjusted):
+            factor, unit = in_file_unit(s.unit)
+            rows.append((s.group, s.axis, s.n, factor * s.mean, factor * s.rmse, factor * s.max_abs, unit))
+        return pd.DataFrame(rows, columns=columns)
 
     @cached_property
     def check_points(self) -> pd.DataFrame:

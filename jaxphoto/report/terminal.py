@@ -6,7 +6,7 @@ from rich.text import Text
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.errors import counted, printable
-from jaxphoto.report.findings import MARKS, Verdict
+from jaxphoto.report.findings import COLOURS, MARKS, Verdict
 from jaxphoto.report.formatting import to_rich
 from jaxphoto.report.residual_findings import component_tables
 from jaxphoto.report.tables import Tables, check_spread, recovery_spread
@@ -14,7 +14,13 @@ from jaxphoto.statistics import VarianceComponents
 
 # Maximum numbers of findings, of notes, and of parameters of mounts and strips.
 _FINDINGS, _NOTES, _PARAMETERS = 12, 3, 18
-_COLOURS = {"note": "green", "warning": "yellow", "error": "red"}
+# Terminal colour of a verdict.
+_TERMINAL = {"green": "green", "amber": "yellow", "red": "red"}
+
+
+def headline(text: str, colour: str) -> Text:
+    """Return a verdict in bold and in its colour: green, amber or red."""
+    return Text(printable(text), f"bold {_TERMINAL[colour]}")
 
 
 def plain(text: str) -> Text:
@@ -30,11 +36,11 @@ def print_lines(lines, console: Console) -> None:
 
 def print_verdict(verdict: Verdict, console: Console) -> None:
     """Print a verdict with its errors and warnings, or its first notes."""
-    console.print(Text(verdict.headline, f"bold {_COLOURS[verdict.severity]}"))
+    console.print(headline(verdict.headline, verdict.colour))
     serious = sum(finding.severity != "note" for finding in verdict.findings)
     shown = verdict.findings[: min(max(serious, _NOTES), _FINDINGS)]
     for finding in shown:
-        console.print(Text(f"{MARKS[finding.severity]} ", _COLOURS[finding.severity]) + plain(finding.text))
+        console.print(Text(f"{MARKS[finding.severity]} ", _TERMINAL[COLOURS[finding.severity]]) + plain(finding.text))
     if more := len(verdict.findings) - len(shown):
         console.print(f"and {more} more in report.html")
 
@@ -76,4 +82,4 @@ def print_components(components: VarianceComponents, console: Console) -> None:
 
 def print_warning(warning: str, console: Console, **options) -> None:
     """Print a warning with a yellow mark."""
-    console.print(Text.assemble(("!", "yellow"), " ", plain(warning)), **options)
+    console.print(Text.assemble(("!", _TERMINAL["amber"]), " ", plain(warning)), **options)

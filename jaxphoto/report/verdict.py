@@ -17,7 +17,7 @@ from jaxphoto.errors import camera_words, few
 from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.procedures.adjust import left_out_words
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
-from jaxphoto.report.formatting import of_sigma, plus_minus, symbol
+from jaxphoto.report.formatting import of_sigma, path_words, plus_minus, symbol
 from jaxphoto.report.residual_findings import NOTHING_FITS, reliability_findings, residual_findings, stretch_findings
 from jaxphoto.report.tables import NEAR_VERTICAL, Tables
 from jaxphoto.statistics import (
@@ -28,26 +28,21 @@ from jaxphoto.statistics import (
     Significance,
     ZeroTest,
     camera_spline_differences,
+    correlation_matrix,
     fix_at_zero,
     prepare_hat_matrix,
     strip_differences,
 )
 from jaxphoto.statistics.block_geometry import size_mismatches
 from jaxphoto.statistics.correlation import FORMS, high_pairs
+from jaxphoto.statistics.determinability import FELT, WEAK_CORRELATION, corner_yardsticks
 from jaxphoto.unknowns import FIXED, Weighted
 
 HIGH_CORRELATION = 0.9
 HIGH_OWN_CORRELATION = 0.95
-WEAK_CORRELATION = 0.9
 FLAT = 0.2
 """Ratio of height range to flying height below which the ground is nearly flat."""
 NEAR_VERTICAL_DEG = 15.0
-FELT = 10.0
-"""Maximum shift of the image corner by one sigma of an interior parameter, in standard deviations of an image point.
-
-Half of `adjustment.POOR`: the limit of a moderate dilution of precision in GNSS. Well-determined blocks over flat
-ground remain below 8, undetermined ones exceed 15 (benchmarks/defects.py).
-"""
 SEEN = 3.0
 """Ratio of a rolling-shutter readout to its standard deviation above which it is significant."""
 _FOR_POINT = "strips in both directions with stations (GNSS), relief or oblique images"
@@ -92,6 +87,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         explained = frozenset().union(*(w.explains for w in weak))
         felt = {name for name, moved in at_corner(tables, camera).items() if moved > FELT}
         yield from _correlated(camera, c, explained, felt)
+    yield from scanner_findings(tables)
     yield from ground_findings(tables)
     yield from shutter_findings(tables)
     yield from drift_findings(tables)
@@ -224,18 +220,10 @@ def weaknesses(tables: Tables, camera: str, c: Correlations) -> list[Weakness]:
 
 
 def at_corner(tables: Tables, camera: str) -> dict[str, float]:
-    """Return the shift of the image corner by one sigma of each estimated parameter, in sigmas of an image point.
-
-    c acts along the radius, the principal point directly; coefficients are scaled (`adjustment.yardsticks`).
-    """
+    """Return the shift of the image corner by one sigma of each estimated parameter, in sigmas of an image point."""
     adjusted = tables.adjusted
-    sensor, rows = adjusted.block.sensors[camera], adjusted.block.image_points
-    of_camera = np.isin(adjusted.structure.image, np.flatnonzero(np.array(adjusted.block.image_camera) == camera))
-    measured = float(np.median(np.asarray(rows.sigma)[of_camera])) if of_camera.any() else 1.0
-    tangent = np.hypot(sensor.width_mm, sensor.height_mm) / 2 / float(adjusted.unknowns.interior[camera].c)
-    units = dict(zip(adjusted.structure.labels, yardsticks(adjusted).shared.tolist(), strict=True))
-    units |= {f"interior[{camera}].c_mm": measured / tangent}
-    units |= {f"interior[{camera}].{name}": measured for name in _POINT}
+    labels, own = adjusted.structure.labels, {camera: adjusted.unknowns.interior[camera]}
+    units = dict(zip(labels, corner_yardsticks(adjusted.block, own, labels, yardsticks(adjusted)), strict=True))
     tests = [s for s in tables.significance if s.camera == camera]
     return {s.parameter: s.sigma / units[f"interior[{camera}].{s.parameter}"] for s in tests}
 
@@ -308,8 +296,8 @@ def _correlated(
     """Report high correlations, except the pairs in `explained`: a warning if the parameter affects the images."""
     subject, limit = camera_words(camera), HIGH_CORRELATION
     if pairs := high_pairs(c.parameters, c.interior, limit):
-        names = few([f"{symbol(a)} and {symbol(b)} {rho:+.3f}" for a, b, rho in pairs])
-        yield Finding("correlation_interior", "note", subject, pairs[0][2], limit, numbers={"pairs": names})
+        words = _correlated_words([(symbol(a), symbol(b), rho) for a, b, rho in pairs])
+        yield Finding("correlation_interior", "note", subject, pairs[0][2], limit, numbers={"pairs": words})
     if len(c.images) == 0:
         return
     expected = [[(e, p) in explained for p in c.parameters] for e in c.eop_names]
@@ -334,6 +322,26 @@ def _correlated(
         names = few([f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in strong[::-1]])
         numbers = {"pairs": names}
         yield Finding("correlation_image", "note", subject, strong[-1][0], HIGH_OWN_CORRELATION, numbers=numbers)
+
+
+def _correlated_words(pairs: list[tuple[str, str, float]]) -> str:
+    """Return "a and b are strongly correlated (rho = +0.95)", for the first pairs and the number of others."""
+    (a, b, rho), others = pairs[0], [f"{a} and {b} ({rho:+.3f})" for a, b, rho in pairs[1:]]
+    return f"{a} and {b} are strongly correlated (rho = {rho:+.3f})" + f", also {few(others)}" * bool(others)
+
+
+def scanner_findings(tables: Tables) -> Iterator[Finding]:
+    """Report strong correlations of the boresight and shifts of the laser scanner with each other and the cameras."""
+    q = tables.covariance
+    first = 6 * q.n_images
+    if not any(label.startswith("scanner") for label in q.labels[first:]):
+        return
+    found = high_pairs(q.labels[first:], correlation_matrix(q)[first:, first:], HIGH_CORRELATION)
+    found = [pair for pair in found if any(label.startswith("scanner") for label in pair[:2])]
+    if found:
+        name = lambda path: path_words(path).partition(" [")[0]  # noqa: E731
+        numbers = {"pairs": _correlated_words([(name(a), name(b), rho) for a, b, rho in found])}
+        yield Finding("correlation_scanner", "warning", "scanner", found[0][2], HIGH_CORRELATION, numbers=numbers)
 
 
 def ground_findings(tables: Tables) -> Iterator[Finding]:

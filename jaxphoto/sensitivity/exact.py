@@ -40,8 +40,9 @@ from jaxphoto.adjustment.model.row_functions import reduced_places
 from jaxphoto.adjustment.model.structure import Structure
 from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block
+from jaxphoto.camera import table_name
 from jaxphoto.compiling import run_compiled
-from jaxphoto.errors import InputError
+from jaxphoto.errors import InputError, few
 from jaxphoto.observations import AXES
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.hessian import (
@@ -182,10 +183,18 @@ class Sensitivity(eqx.Module):
         return self.by_fixed()[1]
 
     def row(self, label: str) -> int:
-        """Return the index of the estimate `label`. Raises InputError if there is none."""
-        if label not in self.labels:
-            raise InputError(f"unknown estimate {label}: choose among {', '.join(self.labels[-8:])} and others")
-        return self.labels.index(label)
+        """Return the index of the estimate `label`: a path, or its last part if unique, such as c or lever_arm_up_m.
+
+        Raises InputError for an unknown or ambiguous label.
+        """
+        name = table_name(label)
+        rows = [k for k, own in enumerate(self.labels) if name in (own, own.rpartition("].")[2])]
+        if len(rows) == 1:
+            return rows[0]
+        if rows:
+            paths = few([self.labels[k] for k in rows], " or ")
+            raise InputError(f"{label} of several owners: give a path, such as {paths}")
+        raise InputError(f"unknown estimate {label}: choose among {', '.join(self.labels[-8:])} and others")
 
 
 @outside_transformations

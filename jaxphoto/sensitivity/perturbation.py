@@ -29,7 +29,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 
 from jaxphoto.block import Block
-from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names
+from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, table_name
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing import TrajectoryKnot, strip_of_knot
 from jaxphoto.observations import (
@@ -241,7 +241,7 @@ def bias(
     """Define errors of one kind, independent for each axis and each strip, image, point, mount or camera.
 
     `kind` is a key of `PER`, `per` one of its entries (default: the first). `sigma`: m for stations, control and lever
-    arms; rad for attitudes and boresights; mm for image points; own units for the interior `parameter` (`c_mm`, `k1`
+    arms; rad for attitudes and boresights; mm for image points; own units for the interior `parameter` (`c`, `k1`
     ...); one value, or one per axis. `of` names the units that get errors (default: all). Lever arms, boresights and
     interior parameters must be FIXED (the fixed value changes) or Weighted (the prior value changes).
 
@@ -257,9 +257,9 @@ def bias(
     if per not in PER[kind]:
         raise InputError(f"a bias of kind {kind} is drawn per {' or '.join(PER[kind])}, not per {per}")
     if (parameter != "") != (kind == "interior"):
-        raise InputError("a parameter name, such as c_mm, is required for a bias of kind interior only")
+        raise InputError("a parameter name, such as c, is required for a bias of kind interior only")
     if kind in ("lever-arm", "boresight", "interior"):
-        return _parameters(block, kind, sigma, of, parameter, distribution)
+        return _parameters(block, kind, sigma, of, table_name(parameter), distribution)
     axes = LABELS[kind]
     arrays = (trajectory_arrays if kind in TRAJECTORY else observed_arrays)(block, kind, per)
     owners = list(dict.fromkeys(name for array in arrays for name in array.owner))

@@ -33,6 +33,7 @@ from jaxphoto.adjustment import (
 from jaxphoto.adjustment.model.block_values import with_start
 from jaxphoto.adjustment.model.numbers import UnknownArrays
 from jaxphoto.adjustment.rank import DEFECT
+from jaxphoto.adjustment.weak_directions import POOR, Yardsticks, image_yardsticks, observed_yardsticks
 from jaxphoto.arrays import ArrayLike
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
@@ -40,6 +41,7 @@ from jaxphoto.devices import AXIS, mesh_of, usable
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.initial.approximate import approximate
 from jaxphoto.statistics.covariance import EOP_NAMES, Rotations, physical_covariance
+from jaxphoto.statistics.determinability import corner_yardsticks, weakly_determined
 from jaxphoto.unknowns import Unknowns
 
 # Number of designs per call of the program, at least one per device.
@@ -72,6 +74,8 @@ class DesignStatistics(NamedTuple):
     """A priori statistics of one design, in metres, radians and the unknowns' own units."""
 
     converged: Bool[ArrayLike, ""]
+    yards: Yardsticks
+    """`adjustment.weak_directions.image_yardsticks`."""
     least_pivot: Float[ArrayLike, ""]
     """Smallest ratio of a pivot to its diagonal element: 1 for independent unknowns, 0 for a rank defect."""
     steps: Int[ArrayLike, ""]
@@ -83,6 +87,8 @@ class DesignStatistics(NamedTuple):
     mean_abs: Float[ArrayLike, "6 shared"]
     """Mean |rho| of X, Y, Z and three rotations with each shared unknown, over the images that the unknown affects."""
     max_abs: Float[ArrayLike, "6 shared"]
+    point_variance: Float[ArrayLike, ""]
+    """Largest variance of a coordinate of an object point."""
     check_variance: Float[ArrayLike, "3"]
     """Variance of computed coordinates, mean over the check points."""
     check_square: Float[ArrayLike, "3"]
@@ -197,6 +203,7 @@ def _statistics(
     error = check.truth - at_optimum.points[:, check.point].T
     return DesignStatistics(
         converged=optima.converged[0],
+        yards=image_yardsticks(equations.scale),
         least_pivot=equations.least_pivot(),
         steps=optima.steps[0],
         sum_of_squares=equations.at.sum_of_squares(),
@@ -204,6 +211,7 @@ def _statistics(
         exterior_variance=free @ variance[:n].reshape(-1, 6) / jnp.sum(free),
         mean_abs=jnp.sum(rho, axis=0) / jnp.sum(touches, axis=0),
         max_abs=jnp.max(rho, axis=0),
+        point_variance=jnp.max(jnp.diagonal(points, axis1=1, axis2=2), initial=0.0),
         check_variance=check.weight @ jnp.diagonal(points[check.point], axis1=1, axis2=2) / n_check,
         check_square=jnp.sum(jnp.where(is_check, error**2, 0.0), axis=0) / n_check,
     )
@@ -225,7 +233,7 @@ class Sweep(eqx.Module):
 
     Standard deviations are a priori (sigma naught 1), in metres, radians, mm and the coefficients' own units.
     Quantities that a design lacks (a fixed unknown, check points) are NaN. All statistics of a design that did not
-    converge or has a rank defect are NaN.
+    converge or has a rank defect are NaN; those of a design with weakly determined unknowns are not.
     """
 
     parameters: tuple[Mapping[str, Any], ...] = eqx.field(static=True)
@@ -235,7 +243,11 @@ class Sweep(eqx.Module):
     """Names of the exterior orientation elements: X, Y, Z and three rotations."""
     converged: Bool[np.ndarray, "designs"]
     determined: Bool[np.ndarray, "designs"]
-    """True for designs without a rank defect."""
+    """False for designs with a rank defect or weakly determined unknowns."""
+    weak: tuple[tuple[str, ...], ...] = eqx.field(static=True)
+    """Weakly determined unknowns of each design, by the criteria of the verdict on an adjustment: labels, and `points`
+    if a coordinate of an object point is weakly determined (`statistics.determinability`).
+    """
     steps: Int[np.ndarray, "designs"]
     redundancy: Int[np.ndarray, "designs"]
     sigma0: Float[np.ndarray, "designs"]
@@ -339,12 +351,15 @@ def _with_labels(
     """Expand the statistics to all `labels`; NaN for labels that a design lacks."""
     n, q = len(designs), len(labels)
     covariance, mean_abs, max_abs = (np.full((n, rows, q), np.nan) for rows in (q, 6, 6))
+    shared = np.full((n, q), np.nan)
     for k, design in enumerate(designs):
         # Designs of one program have equal shapes but may have different labels, such as names of strips.
         index = np.array([labels.index(label) for label in design.labels], int)
         covariance[k][np.ix_(index, index)] = statistics.covariance[k]
         mean_abs[k][:, index], max_abs[k][:, index] = statistics.mean_abs[k], statistics.max_abs[k]
-    return statistics._replace(covariance=covariance, mean_abs=mean_abs, max_abs=max_abs)
+        shared[k][index] = statistics.yards.shared[k]
+    yards = statistics.yards._replace(shared=shared)
+    return statistics._replace(covariance=covariance, mean_abs=mean_abs, max_abs=max_abs, yards=yards)
 
 
 def _sweep(
@@ -357,8 +372,7 @@ def _sweep(
     seconds: dict[str, float],
 ) -> Sweep:
     converged = np.asarray(statistics.converged)
-    determined = np.asarray(statistics.least_pivot) > DEFECT
-    valid = converged & determined
+    valid = converged & (np.asarray(statistics.least_pivot) > DEFECT)
 
     def masked(values):
         """Replace values of invalid designs by NaN."""
@@ -366,12 +380,16 @@ def _sweep(
 
     variance = np.maximum(np.diagonal(statistics.covariance, axis1=1, axis2=2), 0.0)
     sigma = masked(np.sqrt(variance))
+    weak = tuple(
+        _weak(design.block, statistics, labels, sigma[k], k) if valid[k] else () for k, design in enumerate(designs)
+    )
     return Sweep(
         parameters=tuple(design.parameters for design in designs),
         labels=labels,
         eop_names=EOP_NAMES[rotations],
         converged=converged,
-        determined=determined,
+        determined=(np.asarray(statistics.least_pivot) > DEFECT) & np.array([not names for names in weak]),
+        weak=weak,
         steps=np.asarray(statistics.steps),
         redundancy=redundancy,
         sigma0=masked(np.where(redundancy > 0, np.sqrt(statistics.sum_of_squares / np.maximum(redundancy, 1)), 1.0)),
@@ -385,6 +403,17 @@ def _sweep(
         programs=programs,
         seconds=seconds,
     )
+
+
+def _weak(
+    block: Block, statistics: DesignStatistics, labels: tuple[str, ...], sigma: np.ndarray, k: int
+) -> tuple[str, ...]:
+    """Return the weakly determined unknowns of design `k`."""
+    yards = observed_yardsticks(jax.tree.map(lambda v: np.asarray(v)[k], statistics.yards), block, labels)
+    corner = corner_yardsticks(block, block.start.unknowns.interior, labels, yards)
+    rho = np.asarray(statistics.max_abs)[k].max(axis=0)
+    weak = weakly_determined(labels, sigma, yards, corner, rho)
+    return (*weak, "points") if np.sqrt(statistics.point_variance[k]) > POOR * yards.ground else weak
 
 
 def _name(k: int, design: Design) -> str:

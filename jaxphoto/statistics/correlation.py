@@ -95,8 +95,8 @@ def correlations(adjusted: Adjustment, covariance: Covariance) -> dict[str, Corr
 
 def high_pairs(names: Sequence[str], rho: Float[np.ndarray, "n n"], above: float) -> list[tuple[str, str, float]]:
     """List the pairs of parameters with |rho| > `above` and their correlation, largest first."""
-    lower = [(i, j) for i in range(len(names)) for j in range(i)]
-    pairs = [(names[i], names[j], float(rho[i, j])) for i, j in lower if abs(rho[i, j]) > above]
+    upper = [(i, j) for j in range(len(names)) for i in range(j)]
+    pairs = [(names[i], names[j], float(rho[i, j])) for i, j in upper if abs(rho[i, j]) > above]
     return sorted(pairs, key=lambda pair: -abs(pair[2]))
 
 

@@ -19,6 +19,7 @@ from jaxphoto.adjustment import Adjustment, Cofactors, NormalEquations, PaddedRe
 from jaxphoto.adjustment.model.numbers import Increments
 from jaxphoto.adjustment.model.structure import observed_in
 from jaxphoto.arrays import ArrayLike, gathered, to_numpy
+from jaxphoto.camera import table_name
 from jaxphoto.compiling import prepare, run_compiled
 from jaxphoto.errors import counted
 from jaxphoto.rotation import omega_phi_kappa_from_matrix, small_rotation
@@ -94,6 +95,7 @@ class Covariance(eqx.Module):
             for k, label in enumerate(self.labels[first:])
             if label.startswith(prefix)
         }
+        parameters = [table_name(name) for name in parameters]
         free = [k for k, name in enumerate(parameters) if name in index]
         columns = [index[parameters[k]] for k in free]
         covariance = np.zeros((len(parameters), len(parameters)))

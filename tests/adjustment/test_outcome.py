@@ -147,7 +147,7 @@ def test_unknowns_that_nothing_tells_apart_are_named():
     )
     mounts = lambda b: (b.start.unknowns.mounts, b.priors.mounts)  # noqa: E731
     block = eqx.tree_at(mounts, block, ({"imu": Mount(zero, zero)}, {"imu": Mount(FIXED, FIXED, FREE)}))
-    with pytest.raises(RankError, match=r"not separable: .*mounts\[imu\]\.time_offset_s") as caught:
+    with pytest.raises(RankError, match=r"mounts\[imu\]\.time_offset_s.*not separable") as caught:
         adjust(block, block.start.unknowns)
     assert "strips[a].shift_X_m" in str(caught.value)
 

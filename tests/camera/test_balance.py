@@ -53,7 +53,7 @@ def test_k0_is_a_scale_of_the_principal_distance():
     assert after.distortion.k1 == pytest.approx(-3.9e-2 / 1.03, rel=1e-14)
     assert after.distortion.p2 == pytest.approx(-1e-3 / 1.03, rel=1e-14)
     assert after.distortion.p3 == 0.02
-    assert (after.x_p, after.y_p) == (-0.0736, 0.0878)
+    assert (after.xp, after.yp) == (-0.0736, 0.0878)
 
 
 def test_the_principal_distance_of_the_gopro_as_published():

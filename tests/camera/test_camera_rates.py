@@ -63,7 +63,7 @@ def changing():
 
 def test_each_rate_changes_its_own_parameter():
     half_an_hour = TRUE.interior(BROWN, at(1800.0))
-    for name, rate in (("c", 0.06), ("x_p", -0.14), ("y_p", 0.2)):
+    for name, rate in (("c", 0.06), ("xp", -0.14), ("yp", 0.2)):
         assert float(getattr(half_an_hour, name)) == pytest.approx(float(getattr(BROWN, name)) + rate / 2, abs=1e-12)
     assert float(half_an_hour.distortion.k1) == pytest.approx(float(BROWN.distortion.k1) - 1.5e-5, abs=1e-15)
     assert half_an_hour.distortion.k2 == BROWN.distortion.k2

@@ -73,8 +73,8 @@ def test_the_interior_orientation_is_bent_by_the_spline():
     own = dataclasses.replace(ZERO, c_spline=np.arange(6.0), yp_spline=-np.arange(6.0))
     camera = changing_block().start.unknowns.interior["one"]
     bent = own.interior(camera, at(600.0))
-    assert float(bent.c - camera.c) == pytest.approx(3.0) and float(bent.y_p - camera.y_p) == pytest.approx(-3.0)
-    assert float(bent.x_p) == float(camera.x_p)
+    assert float(bent.c - camera.c) == pytest.approx(3.0) and float(bent.yp - camera.yp) == pytest.approx(-3.0)
+    assert float(bent.xp) == float(camera.xp)
 
 
 def test_it_is_tested_without_what_was_known():

@@ -47,6 +47,7 @@ class Tangent(AbstractDistortion):
     name = "tangent_of_a_test"
     domain = "measured"
     coefficients = ("a",)
+    powers = {"a": 0}  # noqa: RUF012
     constants = {"s_mm": "s"}  # noqa: RUF012
     choices = {"way": ("out", "in")}  # noqa: RUF012
 
@@ -66,6 +67,7 @@ class Skewed(Perspective):
     skew: float = 0.0
     name = "skewed_of_a_test"
     coefficients = ("skew",)
+    powers = {"skew": 0}  # noqa: RUF012
 
     def ideal_from_direction(self, c, u, v, w):
         return -c * (u + self.skew * v) / w, -c * v / w
@@ -166,6 +168,16 @@ def test_a_misspelt_coefficient_is_refused_when_the_class_is_defined():
             coefficients = ("k_1",)
 
     assert "misspelt_of_a_test" not in AbstractDistortion.known()
+
+
+def test_a_coefficient_without_unit_is_refused():
+    with pytest.raises(InputError, match="Unitless: the unit of k1 is not declared"):
+
+        class Unitless(AbstractDistortion):
+            k1: float = 0.0
+            name = "unitless_of_a_test"
+            domain = "measured"
+            coefficients = ("k1",)
 
 
 def test_a_field_that_is_declared_nowhere_is_refused():

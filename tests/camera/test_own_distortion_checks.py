@@ -1,6 +1,7 @@
 """Distortions of the user's own that cannot work are refused where they enter."""
 
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 from jaxphoto import AbstractDistortion, InputError
@@ -11,7 +12,7 @@ class Root(AbstractDistortion):
     """Contains the distance itself, whose derivative on the axis is not finite."""
 
     q1: float = 0.0
-    name, domain, coefficients = "root_of_radius", "measured", ("q1",)
+    name, domain, coefficients, powers = "root_of_radius", "measured", ("q1",), {"q1": -1}
 
     def closed_form(self, xy):
         return xy * (1 + self.q1 * jnp.sqrt(jnp.sum(xy**2)))
@@ -21,13 +22,23 @@ class Length(AbstractDistortion):
     """Returns a number instead of a coordinate."""
 
     q1: float = 0.0
-    name, domain, coefficients = "a_length", "measured", ("q1",)
+    name, domain, coefficients, powers = "a_length", "measured", ("q1",), {"q1": -1}
 
     def closed_form(self, xy):
         return self.q1 * jnp.sum(xy**2)
 
 
-@pytest.mark.parametrize("distortion", [Root(), Length(), Root, None])
+class Logarithm(AbstractDistortion):
+    """Is not defined at the corners of the format."""
+
+    q1: float = 0.0
+    name, domain, coefficients, powers = "a_logarithm", "measured", ("q1",), {"q1": 0}
+
+    def closed_form(self, xy):
+        return xy * (1 + self.q1 * jnp.log(100 - jnp.sum(xy**2)))
+
+
+@pytest.mark.parametrize("distortion", [Root(), Length(), Logarithm(), Root, None])
 def test_what_is_no_distortion_is_refused(distortion):
     with pytest.raises(InputError):
         simulated("cross").block.with_distortion("one", distortion, free=("q1",))
@@ -44,4 +55,4 @@ def test_models_of_jaxphoto_pass():
     models = [m for m in AbstractDistortion.known().values() if m.__module__.startswith("jaxphoto.")]
     assert len(models) > 5
     for model in models:
-        model.plain(simulated("cross").block.sensors["one"]).check()
+        model.plain(simulated("cross").block.sensors["one"]).check(np.array([[0.0, 0.0], [18.0, 12.0]]))

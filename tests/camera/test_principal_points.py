@@ -65,7 +65,7 @@ def test_distortion_is_symmetric_about_the_pps_and_not_about_the_ppa():
 def test_conversion_is_decentring_and_goes_back():
     camera = pps_camera()
     brown = to_brown(camera)
-    assert (brown.c, brown.x_p, brown.y_p) == (34.0, 0.065, 0.274)
+    assert (brown.c, brown.xp, brown.yp) == (34.0, 0.065, 0.274)
     d = brown.distortion
     np.testing.assert_allclose([d.k1, d.k2, d.k3], [K1, K2, K3], rtol=1e-15)
     np.testing.assert_allclose([d.p1, d.p2], -K1 * T, rtol=1e-14)

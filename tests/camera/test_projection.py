@@ -256,6 +256,7 @@ def test_a_coefficient_of_projection_and_distortion_is_refused():
         k1: float = 0.0
         name = "bent"
         coefficients = ("k1",)
+        powers = {"k1": 0}  # noqa: RUF012
 
     with pytest.raises(InputError, match="k1 is a coefficient of both the projection bent and the distortion brown"):
         InteriorOrientation(C, projection=Bent())

@@ -34,7 +34,7 @@ def by_bisection(interior, position, camera_from_object, motion, readout_ms, poi
         r = np.hypot(*ideal)
         # The measured radius of an ideal one: ideal = measured (1 - k1 r^2 - k2 r^4).
         measured = brentq(lambda m: m * (1 - k1 * m**2 - k2 * m**4) - r, 0.0, 1.3 * r + 1e-9, xtol=1e-13)
-        return ideal * measured / r + [float(interior.x_p), float(interior.y_p)]
+        return ideal * measured / r + [float(interior.xp), float(interior.yp)]
 
     row = lambda t: t + 1e-3 * readout_ms * seen(t)[1] / SENSOR.height_mm  # noqa: E731
     return seen(brentq(row, -1e-3 * abs(readout_ms), 1e-3 * abs(readout_ms), xtol=1e-14))
@@ -121,7 +121,7 @@ def check(found, share=0.1):
     assert 0.9 < found.sigma0 < 1.1
     readout = float(found.unknowns.more["shutters"]["one"].readout)
     assert abs(readout - READOUT_MS) < 3 * sigma < share * READOUT_MS
-    for field, label in {"c": "c_mm", "x_p": "xp_mm", "y_p": "yp_mm"}.items():
+    for field, label in {"c": "c_mm", "xp": "xp_mm", "yp": "yp_mm"}.items():
         off = float(getattr(found.unknowns.interior["one"], field)) - float(getattr(BROWN, field))
         assert abs(off) < 3 * own[f"interior[one].{label}"]
 

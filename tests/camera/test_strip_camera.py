@@ -59,7 +59,7 @@ def found(sigma, step=None):
 
 def test_each_strip_has_its_own_camera():
     bent = MORE.interior(BROWN, None)
-    for field, more in (("c", 0.04), ("x_p", -0.06), ("y_p", 0.05)):
+    for field, more in (("c", 0.04), ("xp", -0.06), ("yp", 0.05)):
         assert float(getattr(bent, field)) == pytest.approx(float(getattr(BROWN, field)) + more, abs=1e-12)
     assert bent.distortion == BROWN.distortion
 

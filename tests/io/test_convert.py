@@ -39,7 +39,7 @@ def test_sxb(data_dir):
     assert len(block.fixed.who) == 0
     camera = block.start.unknowns.interior["camera"]
     assert float(camera.c) == 123.9392
-    np.testing.assert_allclose([camera.x_p, camera.y_p], [0.0, 0.18], atol=1e-12)
+    np.testing.assert_allclose([camera.xp, camera.yp], [0.0, 0.18], atol=1e-12)
     assert free(block) == set()
     np.testing.assert_allclose(np.unique(np.round(block.image_points.sigma, 12)), [0.003, 0.006])
     # Observations minus unknowns: the redundancy of the report.
@@ -48,7 +48,7 @@ def test_sxb(data_dir):
     # x = 0.006 col - 26.577, y = -(0.006 row - 38.811), both from the principal point.
     first = block.points.index("317")
     line = np.flatnonzero((block.image_points.point == first) & (block.image_points.image == 0))[0]
-    xy = np.asarray(block.image_points.xy)[line] - np.array([camera.x_p, camera.y_p])
+    xy = np.asarray(block.image_points.xy)[line] - np.array([camera.xp, camera.yp])
     np.testing.assert_allclose(xy, [0.006 * 5007.6667 - 26.577, -(0.006 * 7275.6667 - 38.811)], atol=1e-12)
 
     angles = np.deg2rad(np.stack([reported(report, name) for name in ("Omega", "Phi", "Kappa")], axis=1))
@@ -98,7 +98,7 @@ def test_camcal(data_dir):
     assert free(block) == {"c_mm", "xp_mm", "yp_mm", "k1", "k2", "k3", "p1", "p2", "b1"}
     camera = block.start.unknowns.interior["camera"]
     assert isinstance(camera.distortion, AffineBrown)
-    assert (float(camera.c), float(camera.x_p), float(camera.y_p)) == (7.5, 0.0, 0.0)
+    assert (float(camera.c), float(camera.xp), float(camera.yp)) == (7.5, 0.0, 0.0)
     np.testing.assert_allclose(block.sensors["camera"].pixel_mm, 5.43764 / 1704)
     np.testing.assert_allclose(block.image_points.sigma, 0.1 * 5.43764 / 1704)
     assert 4148 - (9 + 126 + 96 * 3) == 3725

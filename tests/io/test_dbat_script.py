@@ -52,7 +52,7 @@ def test_lens_models_agree_with_dbat(tmp_path, model):
     sensor, interior, *_ = read_camera(Section("a", name, dict(values)))
     for column, row in ((1.0, 1.0), (2272.0, 30.0), (700.5, 1704.0)):
         xy = sensor.mm_from_px(np.array([[column - 0.5, row - 0.5]]))[0]
-        ideal = interior.distortion.closed_form(xy - np.array([float(interior.x_p), float(interior.y_p)]))
+        ideal = interior.distortion.closed_form(xy - np.array([float(interior.xp), float(interior.yp)]))
         np.testing.assert_allclose(ideal, corrected(column, row, model), rtol=0, atol=1e-12)
 
 

@@ -56,7 +56,7 @@ def test_start_and_priors(write_folder):
     np.testing.assert_array_equal(start.points, [[1, 2, 3], [2.5, 2.5, 4], [5, 6, 7], [0, 0, 0]])
     assert float(start.interior["kodak"].distortion.k1) == -1e-4
     assert priors.interior["kodak"].c == FREE
-    assert priors.interior["kodak"].x_p == FIXED
+    assert priors.interior["kodak"].xp == FIXED
     weighted = priors.interior["kodak"].distortion.k1
     assert isinstance(weighted, Weighted)
     assert (float(weighted.value), float(weighted.sigma)) == (-1e-4, 2e-5)

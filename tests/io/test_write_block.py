@@ -206,5 +206,5 @@ def test_free_stays_free(write_folder, tmp_path):
     write_block(read_block(write_folder()), tmp_path / "copy")
     priors = read_block(tmp_path / "copy").priors
     assert priors.interior["kodak"].c == FREE
-    assert priors.interior["kodak"].y_p == FIXED
+    assert priors.interior["kodak"].yp == FIXED
     assert isinstance(priors.interior["kodak"].distortion.k1, Weighted)

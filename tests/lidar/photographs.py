@@ -11,8 +11,8 @@ def rendered(sensor, interior, position, angles, height, texture):
     Every pixel's ray is followed to the ground, and the ground's brightness there is `texture` (X, Y).
     """
     column, row = np.meshgrid(np.arange(sensor.width_px) + 0.5, np.arange(sensor.height_px) + 0.5)
-    x = (column - sensor.width_px / 2) * sensor.pixel_mm - interior.x_p
-    y = (sensor.height_px / 2 - row) * sensor.pixel_mm - interior.y_p
+    x = (column - sensor.width_px / 2) * sensor.pixel_mm - interior.xp
+    y = (sensor.height_px / 2 - row) * sensor.pixel_mm - interior.yp
     square = x * x + y * y
     x, y = (v - v * (interior.distortion.k1 * square + interior.distortion.k2 * square**2) for v in (x, y))
     rays = np.stack([x, y, np.full(x.shape, -interior.c)], axis=-1) @ camera_from_object(*angles)

@@ -31,7 +31,7 @@ class Camera(NamedTuple):
         r = target.copy()
         for _ in range(30):
             r -= (r - self.k1 * r**3 - self.k2 * r**5 - target) / (1 - 3 * self.k1 * r**2 - 5 * self.k2 * r**4)
-        return ideal * np.divide(r, target, out=np.ones_like(r), where=target > 0) + [self.x_p, self.y_p]
+        return ideal * np.divide(r, target, out=np.ones_like(r), where=target > 0) + [self.xp, self.yp]
 
 
 class Scene(NamedTuple):
@@ -246,7 +246,7 @@ def errors_with_covariance(adjusted, scene, camera=None):
     shown = list(range(6 * n))
     if camera is not None:
         interior = adjusted.unknowns.interior["camera"]
-        errors = np.append(errors, np.array([interior.c, interior.x_p, interior.y_p]) - camera[:3])
+        errors = np.append(errors, np.array([interior.c, interior.xp, interior.yp]) - camera[:3])
         shown += [found.labels.index(f"interior[camera].{name}") for name in ("c_mm", "xp_mm", "yp_mm")]
         apply = np.block([[apply, np.zeros((6 * n, 3))], [np.zeros((3, 6 * n)), np.eye(3)]])
     matrix = apply @ np.asarray(found.matrix)[np.ix_(shown, shown)] @ apply.T * float(found.variance_factor)

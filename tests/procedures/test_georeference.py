@@ -91,7 +91,7 @@ def test_point_covariance_is_the_scatter_of_many_draws(p):
     camera = truth.interior["one"]
     error = {name: sigma * rng.normal(size=n) for name, sigma in INTERIOR_SIGMA.items()}
     xy = np.asarray(rows.xy)[mine] + 0.004 * rng.normal(size=(n, mine.sum(), 2))
-    reduced = xy - np.stack([camera.x_p + error["xp_mm"], np.full(n, camera.y_p)], 1)[:, None]
+    reduced = xy - np.stack([camera.xp + error["xp_mm"], np.full(n, camera.yp)], 1)[:, None]
     r2 = (reduced**2).sum(2)
     k1 = camera.distortion.k1 + error["k1"][:, None]
     ideal = reduced * (1 - k1 * r2 - camera.distortion.k2 * r2**2)[..., None]

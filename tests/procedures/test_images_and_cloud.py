@@ -48,7 +48,7 @@ def test_the_camera_is_calibrated_at_once():
     found, truth = both(), misaligned().truth.interior["kodak"]
     a, known = found.adjusted, covariance(found.adjusted)
     own = slice(0, a.structure.n_interior)
-    true = [truth.c, truth.x_p, truth.y_p, truth.distortion.k1, truth.distortion.k2]
+    true = [truth.c, truth.xp, truth.yp, truth.distortion.k1, truth.distortion.k2]
     off = np.asarray(a.values.shared)[a.structure.free][own] - true
     assert (np.abs(off) < 3 * np.asarray(known.shared_sigma)[own]).all()
 

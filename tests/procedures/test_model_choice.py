@@ -50,7 +50,7 @@ def perfect(block):
     for _ in range(60):  # ideal = x (1 - k1 r^2 - k2 r^4), inverted by repetition
         r2 = (x**2).sum(1, keepdims=True)
         x = np.array(ideal) / (1 - float(camera.distortion.k1) * r2 - float(camera.distortion.k2) * r2**2)
-    return x + np.array([float(camera.x_p), float(camera.y_p)])
+    return x + np.array([float(camera.xp), float(camera.yp)])
 
 
 def drawn(block, perfect, seed, image_sigma=0.004):

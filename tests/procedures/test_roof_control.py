@@ -34,7 +34,7 @@ def test_points_on_roofs_are_held_on_their_planes():
 def test_roofs_and_heights_calibrate_the_camera():
     a, truth = on_roofs().adjusted, scanned().truth.interior["kodak"]
     known = covariance(a)
-    true = [truth.c, truth.x_p, truth.y_p, truth.distortion.k1, truth.distortion.k2]
+    true = [truth.c, truth.xp, truth.yp, truth.distortion.k1, truth.distortion.k2]
     off = (np.asarray(a.values.shared)[a.structure.free] - true) / np.asarray(known.shared_sigma)
     assert (np.abs(off) < 3.5).all()
 

@@ -25,7 +25,7 @@ def controlled(method: str) -> LidarControl:
 def errors(control: LidarControl) -> np.ndarray:
     """Of shared unknowns over their standard deviations."""
     a, truth = control.adjusted, scanned().truth.interior["kodak"]
-    true = np.array([truth.c, truth.x_p, truth.y_p, truth.distortion.k1, truth.distortion.k2])
+    true = np.array([truth.c, truth.xp, truth.yp, truth.distortion.k1, truth.distortion.k2])
     known = covariance(a)
     return (np.asarray(a.values.shared)[a.structure.free] - true) / np.asarray(known.shared_sigma)
 

@@ -79,7 +79,7 @@ def test_a_stopped_solution_reports_weak_directions():
     stopped = dataclasses.replace(optimum, converged=np.array(False))
     first, *others = verdict_of(Tables(stopped)).findings
     assert "step limit" in first.text
-    assert any("c of camera one with Z of all images: hardly determined" in f.text for f in others)
+    assert any("c of camera one with Z of all images: hardly separable" in f.text for f in others)
     assert {f.severity for f in (first, *others)} == {"error"}
 
 

@@ -165,14 +165,14 @@ def test_derivative_by_a_fixed_lever_arm() -> None:
     a = adjust(block, truth, priors)
     result = sensitivity(a, curvature=True)
     column = result.fixed_labels.index("mounts[imu].lever_arm_forward_m")
-    row = result.row("interior[one].yp_mm")
+    row = result.row("yp")
 
     def principal_point(h: float) -> float:
         moved = a.unknowns.mounts["imu"].lever_arm + np.array([0, h, 0])
         unknowns = eqx.tree_at(lambda u: u.mounts["imu"].lever_arm, a.unknowns, moved)
         for _ in range(3):
             unknowns = adjust(block, unknowns, priors).unknowns
-        return float(unknowns.interior["one"].y_p)
+        return float(unknowns.interior["one"].yp)
 
     step = 0.05
     weights = {-2: 1.0, -1: -8.0, 1: 8.0, 2: -1.0}

@@ -64,7 +64,7 @@ def test_a_draw_is_the_optimum_of_its_own_block(name):
 @pytest.mark.slow
 def test_what_is_held_can_be_drawn():
     nominal = adjusted("fixed_interior")
-    wrong = bias(nominal.block, "interior", 0.02, parameter="c_mm")
+    wrong = bias(nominal.block, "interior", 0.02, parameter="c")
     draws = monte_carlo(nominal, wrong, 2, exterior=True, points=True)
     (name,) = draws.recorded
     assert name == "one.c_mm"

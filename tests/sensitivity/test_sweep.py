@@ -15,7 +15,9 @@ from matplotlib.figure import Figure
 import jaxphoto
 from jaxphoto import FREE, DatumError, InputError, RankError
 from jaxphoto.adjustment import PaddedSizes, common_sizes
+from jaxphoto.adjustment.weak_directions import Yardsticks
 from jaxphoto.report.sweep import plot_sweep, sweep_figure, sweep_table
+from jaxphoto.report.verdict import verdict_of
 from jaxphoto.sensitivity import sweep as side_by_side
 from jaxphoto.sensitivity.sweep import Design, Sweep, sweep
 from jaxphoto.statistics import correlations
@@ -47,6 +49,7 @@ DESIGNS: dict[str, dict[str, Any]] = {
     "no check points": {"targets": [{"count": 8, "role": "control"}]},
     "singular": UPRIGHT | LOOSE,
     "blunder": {"start.points_m": 1.0},
+    "flat": {"terrain": {"kind": "flat"}, "sigmas.station_m": 50.0},
 }
 NAMES = list(DESIGNS)
 STUDY = Path(__file__).resolve().parents[2] / "experiments" / "correlation_study"
@@ -151,12 +154,22 @@ def test_simulated_check_points_scatter_as_predicted(swept):
 def test_what_says_nothing_is_kept_and_marked(designs, swept, sizes):
     singular, blunder = NAMES.index("singular"), NAMES.index("blunder")
     assert np.flatnonzero(~swept.converged).tolist() == [blunder]
-    assert np.flatnonzero(~swept.determined & swept.converged).tolist() == [singular]
+    assert np.flatnonzero(np.isnan(swept.sigma0) & swept.converged).tolist() == [singular]
+    assert not swept.determined[singular]
     with pytest.raises(RankError, match="not separable"):
         jaxphoto.adjust(designs[singular].block, sizes=sizes)
     for k in (singular, blunder):
         for values in (swept.sigma0, swept.sigma, swept.correlation, swept.mean_abs, swept.check_rmse):
             assert np.isnan(values[k]).all()
+
+
+@pytest.mark.parametrize("name", ["base", "flat"])
+def test_a_design_is_determined_if_its_adjustment_has_no_warning(name, designs, swept, sizes):
+    k = NAMES.index(name)
+    verdict = verdict_of(jaxphoto.Tables(jaxphoto.adjust(designs[k].block, sizes=sizes)))
+    assert swept.determined[k] == (verdict.colour == "green")
+    assert swept.weak[k] == (("interior[kodak].c_mm",) if name == "flat" else ())
+    assert np.isfinite(swept.sigma0[k])
 
 
 def test_other_kinds_of_observations_are_another_program(monkeypatch):
@@ -170,8 +183,8 @@ def test_other_kinds_of_observations_are_another_program(monkeypatch):
         numbers = np.array([design.redundancy for design in prepared])
         ones = np.ones((n, 6, q))
         return side_by_side.DesignStatistics(
-            np.ones(n, bool), np.ones(n), numbers, 4.0 * numbers, np.tile(np.eye(q), (n, 1, 1)), ones[..., 0],
-            ones, ones, ones[:, :3, 0], ones[:, :3, 0],
+            np.ones(n, bool), Yardsticks(np.ones(n), np.ones(n), ones[:, 0]), np.ones(n), numbers, 4.0 * numbers,
+            np.tile(np.eye(q), (n, 1, 1)), ones[..., 0], ones, ones, np.ones(n), ones[:, :3, 0], ones[:, :3, 0],
         )  # fmt: skip
 
     monkeypatch.setattr(importlib.import_module("jaxphoto.sensitivity.sweep"), "evaluate", evaluate)
@@ -214,6 +227,7 @@ def test_the_table_is_tidy(swept):
         "design",
         "converged",
         "determined",
+        "weak",
         "quantity",
         "of",
         "value",

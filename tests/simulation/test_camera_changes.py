@@ -30,12 +30,12 @@ def test_every_exposure_sees_through_the_camera_of_its_time():
     assert b[0] - a[-1] == pytest.approx(120.0)
     np.testing.assert_allclose(a - a.mean(), block.image_time[strips == "A"], atol=1e-9)
     seen = compiled(lambda c, x_p, position, rotation, point: project(
-        dataclasses.replace(camera, c=c, x_p=x_p), ExteriorOrientation(position, rotation), point
+        dataclasses.replace(camera, c=c, xp=x_p), ExteriorOrientation(position, rotation), point
     ))  # fmt: skip
     for k in range(0, len(rows), 41):
         i, hours = rows.image[k], time[rows.image[k]] / 3600
         position, rotation = (np.asarray(v)[i] for v in (truth.exterior.position, truth.exterior.camera_from_object))
-        own = seen(camera.c + 0.5 * hours, camera.x_p - 0.3 * hours, position, rotation, truth.points[rows.point[k]])
+        own = seen(camera.c + 0.5 * hours, camera.xp - 0.3 * hours, position, rotation, truth.points[rows.point[k]])
         np.testing.assert_allclose(rows.xy[k], own, atol=1e-9)
     assert 0.01 < np.abs(rows.xy - plain().block.image_points.xy).max() < 0.1
 

@@ -49,7 +49,7 @@ def test_the_folder_reads_as_the_simulated_block(name, tmp_path, monkeypatch, ca
     assert tuple(truth["object_points"]["point"]) == want.block.points
     interior = truth["interior"].set_index("parameter")["value"]
     (camera,) = want.truth.interior.values()
-    assert (interior["c_mm"], interior["xp_mm"], interior["k1"]) == (camera.c, camera.x_p, camera.distortion.k1)
+    assert (interior["c_mm"], interior["xp_mm"], interior["k1"]) == (camera.c, camera.xp, camera.distortion.k1)
 
 
 @pytest.mark.parametrize(

@@ -106,7 +106,7 @@ def test_start_is_what_the_block_knows_and_truth_what_is():
     assert (float(kodak.c), float(kodak.distortion.k1), float(kodak.distortion.k2)) == (34.0, -8e-5, 0.0)
     assert (float(true.c), float(true.distortion.k1), float(true.distortion.k2)) == (34.25, -9.12e-5, 1.0435e-7)
     priors = block.priors.interior["kodak"]
-    assert (priors.c, priors.x_p, priors.distortion.k1) == (FREE, FIXED, FREE)
+    assert (priors.c, priors.xp, priors.distortion.k1) == (FREE, FIXED, FREE)
     off = np.asarray(start.exterior.position) - true_positions(plain())
     assert 3 < off.std() < 7
     turn = np.einsum("nij,nkj->nik", start.exterior.camera_from_object, truth.exterior.camera_from_object)

@@ -70,7 +70,7 @@ def test_truth_is_recovered_within_its_sigmas():
     result, (_, truth) = adjusted("cross"), simulated("cross")
     for s in significance(result, covariance(result)):
         interior = truth.interior["one"]
-        place = {"c_mm": interior.c, "xp_mm": interior.x_p, "yp_mm": interior.y_p}
+        place = {"c_mm": interior.c, "xp_mm": interior.xp, "yp_mm": interior.yp}
         true = place.get(s.parameter, getattr(interior.distortion, s.parameter, None))
         assert abs(s.value - float(true)) < 4 * s.sigma, s.parameter
 

@@ -43,7 +43,7 @@ def test_the_interior_orientation_moves_as_said_with_an_error_that_no_test_finds
         value[row] += sign * 0.1 * mdbs[group][row]
         with_error = adjust(dataclasses.replace(a.block, **{field: dataclasses.replace(rows, value=value)}))
         camera = with_error.unknowns.interior["one"]
-        moved.append([float(camera.c), float(camera.x_p), float(camera.y_p)])
+        moved.append([float(camera.c), float(camera.xp), float(camera.yp)])
     change = np.abs(np.subtract(*moved)) / 0.2
     sigmas = np.sqrt(np.diagonal(q.of_interior("one", ("c_mm", "xp_mm", "yp_mm"))) / float(q.variance_factor))
     predicted = [e.interior[name][group][row] for name in ("c_mm", "xp_mm", "yp_mm")]

@@ -178,6 +178,6 @@ def _components(prior: object, n: int) -> list[object]:
 
 def _leaf_names(interior: InteriorOrientation) -> list[str]:
     """Return parameter names in the order of the tree's leaves; constants use the name of their field."""
-    estimable = dict(zip(("c", "x_p", "y_p"), parameter_names(interior), strict=False))
+    estimable = dict(zip(("c", "xp", "yp"), parameter_names(interior), strict=False))
     paths = jax.tree_util.tree_flatten_with_path(interior)[0]
     return [estimable.get(path[-1].name, path[-1].name) for path, _ in paths]

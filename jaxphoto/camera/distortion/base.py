@@ -94,16 +94,27 @@ class AbstractDistortion(Declared):
         """Return the commonly needed coefficients: all except `rare` and `scales`."""
         return tuple(name for name in cls.coefficients if name not in (*cls.rare, *cls.scales))
 
-    def check(self) -> None:
-        """Raise InputError if `closed_form` does not map a coordinate to one, with a derivative on the optical axis."""
+    def check(self, xy: Float[np.ndarray, "points 2"]) -> None:
+        """Raise InputError unless `closed_form` maps coordinates to coordinates, with a derivative on the optical axis.
+
+        `xy` are points of the image format, in the model's unit: at none of them the result may be NaN or infinite.
+        """
         axis = jnp.zeros(2)
         shape = jax.eval_shape(self.closed_form, axis).shape
         if shape != (2,):
             raise InputError(f"{type(self).__qualname__}.closed_form returns the shape {shape}; it must be (2,)")
-        if not np.isfinite(jax.jit(jax.jacfwd(self.closed_form))(axis)).all():
+        slope, mapped = jax.jit(lambda xy: (jax.jacfwd(self.closed_form)(axis), jax.vmap(self.closed_form)(xy)))(xy)
+        if not np.isfinite(slope).all():
             raise InputError(
                 f"{type(self).__qualname__}.closed_form has no derivative at (0, 0): replace the square root of "
                 "x^2 + y^2 by powers of r^2"
+            )
+        valid = np.isfinite(mapped).all(axis=1)
+        if not valid.all():
+            x, y = xy[~valid][0]
+            raise InputError(
+                f"{type(self).__qualname__}.closed_form is NaN or infinite at ({x:.4g}, {y:.4g}), inside the image "
+                "format: check its formula, its coefficients and their units"
             )
 
     @abc.abstractmethod

@@ -138,7 +138,7 @@ def _kind_of(interior: InteriorOrientation) -> str:
 
 def _add_values(calibration: ElementTree.Element, sensor: Sensor, interior: InteriorOrientation) -> None:
     f = float(interior.c) / sensor.pixel_mm
-    values = {"f": f, "cx": float(interior.x_p) / sensor.pixel_mm, "cy": -float(interior.y_p) / sensor.pixel_mm}
+    values = {"f": f, "cx": float(interior.xp) / sensor.pixel_mm, "cy": -float(interior.yp) / sensor.pixel_mm}
     for key in Agisoft.coefficients:
         values[key] = float(getattr(interior.distortion, key)) * (f if key in _SCALED else 1.0)
     for key, number in values.items():

@@ -188,8 +188,8 @@ def _written(camera: ProjectCamera) -> dict[str, Any]:
         "height": sensor.height_px,
         "focal_x": focal * (1 + camera.terms(("b1",))["b1"]),
         "focal_y": focal,
-        "c_x": float(interior.x_p) / longer_mm,
-        "c_y": -float(interior.y_p) / longer_mm,
+        "c_x": float(interior.xp) / longer_mm,
+        "c_y": -float(interior.yp) / longer_mm,
         **camera.terms(FISHEYE_TERMS if fisheye else BROWN_TERMS),
     }
 

@@ -122,7 +122,7 @@ def in_pixels(
 def pixels_of(interior: InteriorOrientation, sensor: Sensor) -> tuple[float, float, float, float]:
     """Return fx, fy and the principal point (column, row) in pixels: the inverse of `in_pixels`."""
     fy = float(interior.c / sensor.pixel_mm)
-    column, row = sensor.px_from_mm(np.array([[float(interior.x_p), float(interior.y_p)]]))[0]
+    column, row = sensor.px_from_mm(np.array([[float(interior.xp), float(interior.yp)]]))[0]
     return fy * (1 + float(getattr(interior.distortion, "b1", 0.0))), fy, float(column), float(row)
 
 

@@ -25,6 +25,7 @@ from jaxphoto.camera import (
     get_parameter,
     parameter_names,
     set_parameter,
+    table_name,
 )
 from jaxphoto.camera.distortion.open_cv import OpenCv
 from jaxphoto.collinearity import ExteriorOrientation, project
@@ -257,7 +258,7 @@ def distortion_model(name: str, sensor: Sensor, r0_mm: float = 0.0) -> AbstractD
 def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[str] | None = None) -> tuple[str, ...]:
     """Return the parameters to estimate, in the order of the model.
 
-    `wanted` lists names (c, xp, yp for c_mm, ...). The default is c, the principal point, and the coefficients that a
+    `wanted` lists names, such as c, xp, k1. The default is c, the principal point, and the coefficients that a
     board determines (`AbstractDistortion.usual`): for SMAC and Brown K1-K3, P1, P2. Raises InputError for unknown
     names, and for a scale coefficient together with c.
     """
@@ -265,7 +266,7 @@ def free_parameters(name: str, distortion: AbstractDistortion, wanted: Sequence[
     if wanted is None:
         usual = distortion.usual()
         return tuple(n for n in names if n in (*_CENTRAL, *usual))
-    asked = [f"{n}_mm" if n in ("c", "xp", "yp") else n for n in wanted]
+    asked = [table_name(n) for n in wanted]
     for parameter in asked:
         if parameter not in names:
             raise InputError(f"unknown parameter {parameter!r} of the model {name}; choose among {', '.join(names)}")
@@ -358,7 +359,7 @@ def nearest_distortion(
     source, wanted = (measured - np.asarray(known.principal_point), ideal)
     if model.domain == "ideal":
         source, wanted = wanted, source
-    interior = jax.tree.map(lambda v: np.asarray(v, float), InteriorOrientation(known.c, known.x_p, known.y_p, model))
+    interior = jax.tree.map(lambda v: np.asarray(v, float), InteriorOrientation(known.c, known.xp, known.yp, model))
     names = tuple(name for name in free if name in model.coefficients)
     if names:
         begin = np.array([float(get_parameter(interior, name)) for name in names])

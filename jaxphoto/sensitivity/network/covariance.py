@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxphoto.arrays import to_numpy
-from jaxphoto.camera import InteriorOrientation, get_parameter, set_parameter
+from jaxphoto.camera import InteriorOrientation, get_parameter, set_parameter, table_name
 from jaxphoto.collinearity import ExteriorOrientation, camera_coordinates, image_residual, project
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import InputError
@@ -91,6 +91,7 @@ class NetworkCovariance(eqx.Module):
 
     def column(self, name: str) -> int:
         """Return the index of the interior parameter `name` in `free`. Raises InputError if it is fixed."""
+        name = table_name(name)
         if name not in self.free:
             free = ", ".join(self.free) or "none"
             raise InputError(

@@ -22,7 +22,7 @@ from jaxphoto.adjustment.model.block_values import values_of
 from jaxphoto.adjustment.model.structure import structure_of
 from jaxphoto.arrays import ArrayLike, to_numpy
 from jaxphoto.block import Block, Datum, Start
-from jaxphoto.camera import InteriorOrientation, Perspective, Sensor, parameter_names, set_parameter
+from jaxphoto.camera import InteriorOrientation, Perspective, Sensor, parameter_names, set_parameter, table_name
 from jaxphoto.collinearity import ExteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError, InputError
@@ -31,6 +31,10 @@ from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates
 from jaxphoto.rotation import matrix_from_roll_pitch_yaw, roll_pitch_yaw_from_matrix
 from jaxphoto.simulation import FlightPlan, photograph
 from jaxphoto.unknowns import FREE, Unknowns, default_priors
+
+
+def _table_names(names: Sequence[str]) -> tuple[str, ...]:
+    return tuple(map(table_name, names))
 
 
 class Layout(eqx.Module):
@@ -54,7 +58,7 @@ class Layout(eqx.Module):
     attitude_weight: Float[ArrayLike, "..."] | float = 0.0
     """Weight of roll, pitch, yaw by image (1 / rad^2). The camera's x axis points forward."""
     sensor: Sensor = eqx.field(static=True, kw_only=True)
-    free: tuple[str, ...] = eqx.field(static=True, default=("c_mm", "xp_mm", "yp_mm"))
+    free: tuple[str, ...] = eqx.field(static=True, default=("c_mm", "xp_mm", "yp_mm"), converter=_table_names)
     edge_mm: float = eqx.field(static=True, default=1.0)
     """Width of the edge of the format, half of it inside the format. The weight of an image point decreases smoothly to
     zero across the edge, so a layout is differentiable where points enter an image.
