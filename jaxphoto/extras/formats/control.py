@@ -253,11 +253,11 @@ def _unmarked(cells: list[str]) -> tuple[str, int] | None:
 
 def read_gcp_list(path: Path, text: str) -> GivenControl:
     """Read control points and marks. Raise InputError for a first line that is not a coordinate system."""
-    rows, system = _gcp_lines(text), ""
-    if not _is_marked(rows[0][1].split()):
-        (row, system), *rows = rows
-        system_of(system, f"{path.name}, row {row}")
-    cells = Cells(path.name, [line.split() for _, line in rows], [row for row, _ in rows])
+    lines, system = _gcp_lines(text), ""
+    if not _is_marked(lines[0][1].split()):
+        first, system = lines.pop(0)
+        system_of(system, f"{path.name}, row {first}")
+    cells = Cells(path.name, [line.split() for _, line in lines], [row for row, _ in lines])
     if not cells.records:
         raise cells.none(f"no marks after {quoted(system.strip())}; add rows")
     points, marks, names = SurveyRows(path.name), list[Mark](), dict[str, str]()
