@@ -190,7 +190,7 @@ def test_other_texts_are_recognised_by_none(tmp_path, text):
 
 @pytest.mark.filterwarnings("ignore:.*fewer than")
 @pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-16"])
-@pytest.mark.parametrize("name", sorted(FORMATS.keys() & EXPORTS.keys() - {"bal"}) + ["opk"])
+@pytest.mark.parametrize("name", [*sorted(FORMATS.keys() & EXPORTS.keys() - {"bal"}), "opk"])
 def test_names_that_are_not_ascii_are_read_in_every_encoding(tmp_path, name, encoding):
     p = oriented_files.inside("opencv", "local")
     named = [[f"Flüge/{name.replace(' ', '_')}" for name in names] for names in (p.files, p.images)]

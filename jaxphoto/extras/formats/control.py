@@ -146,9 +146,9 @@ def read_table(path: Path, text: str) -> SurveyedPoints | Marks:
     odd = [k for k, r in enumerate(records) if len(r) != usual]
     if 2 * len(odd) < len(records) and _without_header([r for r in records if len(r) == usual])[0]:
         raise cells.bad(odd[0], f"{counted(len(records[odd[0]]), 'cell')}, but most rows have {usual}; complete it")
-    first, below = cells.records[0], cells.records[1:2]
+    first, second = cells.records[0], cells.records[min(1, len(cells.records) - 1)]
     wrong = "is neither a header nor a point nor a mark"
-    if not any(map(is_number, first)) and any(map(is_number, *below)):
+    if not any(map(is_number, first)) and any(map(is_number, second)):
         wrong = "is a header without the columns of points or marks"
     raise cells.bad(
         0,
@@ -227,13 +227,12 @@ def _gcp_lines(text: str) -> list[tuple[int, str]]:
 
 
 def _is_gcp_list(path: Path, text: str) -> bool:
-    lines = [line for _, line in _gcp_lines(text)]
+    lines = [line.strip() for _, line in _gcp_lines(text)]
     cells = lines[1].split() if len(lines) > 1 else []
-    if not lines or not SYSTEM.match(lines[0].strip()):
-        # The system may be missing, or unknown: such lists are recognised by the names of photographs.
-        return any(
-            _is_marked(row) and bool(_PICTURE.search(row[5])) for row in (lines[0].split() if lines else [], cells)
-        )
+    if not lines or not SYSTEM.match(lines[0]):
+        # Lists without a system, or with an unknown one, are recognised by the names of photographs.
+        rows = [line.split() for line in lines[:2]]
+        return any(_is_marked(row) and bool(_PICTURE.search(row[5])) for row in rows)
     return len(lines) == 1 or _is_marked(cells) or _unmarked(cells) is not None
 
 
