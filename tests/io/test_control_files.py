@@ -51,7 +51,8 @@ LISTED = "16.6 59.3 62.6 2799.29 2159.83 a.JPG\n16.61 59.3 62.6 1676.11 2488.37 
     ("system", "code"),
     [
         ("WGS84\t", 4326), ("wgs 84", 4326), ("EPSG:4326", 4326), ("WGS84 UTM 33N", 32633),
-        ("WGS 84 / UTM zone 33N", 32633),        ("+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs", 32633), ("local", None),
+        ("WGS 84 / UTM zone 33N", 32633),
+        ("+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs", 32633), ("local", None),
     ],
 )  # fmt: skip
 def test_a_gcp_list_in_every_form_of_its_system(tmp_path, system, code):
