@@ -6,6 +6,7 @@ rotated by the wander angle: true heading = platform heading - wander angle (Fil
 Naval Oceanographic Office). SBET has no standard deviations.
 """
 
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ from jaxphoto.rotation import (
     quaternion_from_matrix,
     roll_pitch_yaw_from_matrix,
 )
+from jaxphoto.rounding import M_PER_DEGREE, rounding_error, rounding_step
 
 FIELDS = (
     "time", "latitude", "longitude", "altitude", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch",
@@ -216,11 +218,37 @@ def positions_in(records: Records, frame: Frame) -> Float[np.ndarray, "records 3
 def trajectory_in(
     records: Records, frame: Frame, sigma_m: Float[np.ndarray, "records 3"], sigma_rad: Float[np.ndarray, "records 3"]
 ) -> Trajectory:
-    """Transform a trajectory to the frame of a block, with the given standard deviations."""
+    """Transform a trajectory to the frame of a block, with the given standard deviations.
+
+    Warns of columns rounded to a step whose error exceeds their standard deviation.
+    """
+    _warn_of_rounding(records, sigma_m, np.rad2deg(sigma_rad))
     position = positions_in(records, frame)
     axes = _frame_from_axes(records, frame, position)
     quaternion = _quaternions(axes, np.deg2rad(records.roll_pitch_yaw_deg))
     return Trajectory(*map(jnp.asarray, (records.time, position, quaternion, sigma_m, sigma_rad)))
+
+
+def _warn_of_rounding(
+    records: Records, sigma_m: Float[np.ndarray, "records 3"], sigma_deg: Float[np.ndarray, "records 3"]
+) -> None:
+    names = (*(_PLACE if records.geographic else _MAP), *_ANGLES)
+    values = np.hstack([records.coordinates, records.roll_pitch_yaw_deg])
+    for name, column, sigma in zip(names, values.T, np.hstack([sigma_m, sigma_deg]).T, strict=True):
+        unit, limit = name.rsplit("_", 1)[1], float(np.median(sigma))
+        if name in _PLACE[:2]:
+            limit /= M_PER_DEGREE
+        step = rounding_step(column, limit, unit)
+        # Rounding errors change the second differences by sqrt(6) times their size; exact tracks at equal intervals,
+        # as simulated, have none.
+        jerky = np.sqrt(np.mean(np.diff(column, 2) ** 2)) > rounding_error(step) if step else False
+        if rounding_error(step) > limit and jerky:
+            warnings.warn(
+                f"{records.file}, column {name}: all values are multiples of {step:.6g} {unit}, sigma is {limit:.2g} "
+                f"{unit}; give them with all their digits, or a larger sigma",
+                UserWarning,
+                stacklevel=3,
+            )
 
 
 def records_of(trajectory: Trajectory, file: str) -> Records:

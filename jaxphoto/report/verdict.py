@@ -1,7 +1,7 @@
 """Verdict on an adjustment: findings on convergence, residuals, geometry and reliability."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -16,7 +16,7 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
 from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.procedures.adjust import left_out_words
-from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
+from jaxphoto.report.findings import SEVERITIES, Finding, Severity, Verdict, p_words
 from jaxphoto.report.formatting import of_sigma, plus_minus, symbol
 from jaxphoto.report.residual_findings import NOTHING_FITS, reliability_findings, residual_findings, stretch_findings
 from jaxphoto.report.tables import NEAR_VERTICAL, Tables
@@ -34,6 +34,7 @@ from jaxphoto.statistics import (
 )
 from jaxphoto.statistics.block_geometry import size_mismatches
 from jaxphoto.statistics.correlation import FORMS, high_pairs
+from jaxphoto.statistics.input_precision import rounded_columns, small_sigmas
 from jaxphoto.unknowns import FIXED, Weighted
 
 HIGH_CORRELATION = 0.9
@@ -83,7 +84,9 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     yield from behind_findings(adjusted)
     yield from looking_up_findings(tables)
     yield from format_findings(adjusted)
-    yield from residual_findings(tables)
+    residual = list(residual_findings(tables))
+    yield from input_findings(tables, residual)
+    yield from residual
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))
     for camera, c in tables.correlations.items():
@@ -143,6 +146,27 @@ def looking_up_findings(tables: Tables) -> Iterator[Finding]:
     if depth.min() > 0 and np.median(upwards) > NEAR_VERTICAL:
         severity: Severity = "error" if adjusted.block.frame.kind == "epsg" else "warning"
         yield Finding("looking_up", severity, value=float(np.median(depth)))
+
+
+def input_findings(tables: Tables, residual: Sequence[Finding]) -> Iterator[Finding]:
+    """Yield columns of rounded values and standard deviations that no instrument reaches.
+
+    Rounding whose errors exceed the standard deviation is a warning; it is as severe as the worst of the `residual`
+    findings, which it may cause, if the residuals of its column are too large.
+    """
+    worst = min((SEVERITIES.index(f.severity) for f in residual), default=len(SEVERITIES) - 1)
+    for c in rounded_columns(tables.adjusted, tables.redundancy):
+        severity: Severity = "warning" if c.exceeded or c.error > c.sigma else "note"
+        if c.exceeded:
+            severity = SEVERITIES[min(worst, SEVERITIES.index(severity))]
+        numbers = {"n": c.n, "unit": c.unit, "error": c.error}
+        numbers["cause"] = " and may cause the findings below" if c.exceeded and residual else ""
+        hint = "Its sigma must include that error" if severity == "note" else ""
+        yield Finding("rounded", severity, f"{c.table}, column {c.column}", c.step, c.sigma, hint, numbers)
+    for s in small_sigmas(tables.adjusted):
+        subject = f"{s.table}, sigma of {', '.join(s.axes)}" if s.axes else f"{s.table}, sigma"
+        numbers = {"n": s.n, "total": s.total, "unit": s.unit}
+        yield Finding("small_sigma", "warning", subject, s.sigma, s.limit, numbers=numbers)
 
 
 def format_findings(adjusted: Adjustment) -> Iterator[Finding]:
