@@ -19,11 +19,11 @@ from jaxphoto.observations.base import AXES, AbstractCoordinates
 from jaxphoto.observations.columns import FILE_UNITS, columns_of
 from jaxphoto.rounding import M_PER_DEGREE, rounding_error, rounding_step
 from jaxphoto.statistics.quantiles import chi_square_tails
-from jaxphoto.statistics.reliability import Redundancy
+from jaxphoto.statistics.reliability import LEAST_CHECKED, Redundancy
 
 # Fraction of the contribution of rounding errors to v'Pv below which values are not rounded.
 _EXACT = 0.25
-# p-value of v'Pv below which the residuals of a column exceed its standard deviations.
+# p-value of v'Pv or of the largest w below which the residuals of a column exceed its standard deviations.
 _LEVEL = 1e-3
 # Relative standard deviation of the most precise distance meters (Kern Mekometer ME5000: 0.2 mm + 0.2 mm/km; Rüeger,
 # Electronic Distance Measurement, 1996), applied to the extent of the block, and half of their constant part.
@@ -86,18 +86,22 @@ def rounded_columns(adjusted: Adjustment, redundancy: Redundancy) -> list[Rounde
     found = []
     for group, rows in _groups(adjusted):
         v = rows.physical(np.asarray(adjusted.residuals[group])) / np.asarray(rows.sigmas).T
-        r, seen = np.asarray(redundancy[group]), np.zeros(v.shape, bool)
+        r = np.asarray(redundancy[group])
+        # The same values may be multiples of a step in several forms: of the coarsest in the file.
+        steps: dict[bytes, tuple[float, float, float, _Column]] = {}
         for column in _columns(adjusted.block, group, rows):
             sigma = float(np.median(column.sigma))
-            step = 0.0 if seen[column.rows].any() else rounding_step(column.values, sigma, column.unit)
-            if not step:
-                continue
-            seen |= column.rows
-            tau, of, numbers = rounding_error(step), v[column.rows], r[column.rows]
+            if step := rounding_step(column.values, sigma, column.unit):
+                key = column.rows.tobytes()
+                steps[key] = max(steps.get(key, (0.0,)), (step / sigma, step, sigma, column), key=lambda c: c[0])  # type: ignore[assignment]
+        for _, step, sigma, column in steps.values():
+            of, numbers = v[column.rows], r[column.rows]
             vpv, total = float((of**2).sum()), float(numbers.sum())
-            if vpv < _EXACT * float((numbers**2 * tau**2 / column.sigma**2).sum()):
+            if vpv < _EXACT * float((numbers**2 * rounding_error(step) ** 2 / column.sigma**2).sum()):
                 continue
-            exceeded = total >= 1 and vpv > total and chi_square_tails(vpv, total)[1] < _LEVEL
+            w = np.abs(of / np.sqrt(numbers))[numbers > LEAST_CHECKED]
+            exceeded = len(w) > 0 and len(w) * chi_square_tails(float(w.max(initial=0.0)) ** 2, 1)[1] < _LEVEL
+            exceeded |= total >= 1 and vpv > total and chi_square_tails(vpv, total)[1] < _LEVEL
             found.append(RoundedColumn(group, column.name, column.unit, len(of), step, sigma, exceeded))
     return found
 
@@ -173,13 +177,15 @@ def _coordinates(
     who, axis = np.asarray(rows.who), np.asarray(rows.axis)
     if block.frame.kind != "epsg":
         for k, name in enumerate(AXES):
-            at = np.flatnonzero(axis == k)
-            yield f"{name}_m", "m", at, values[at]
+            if len(at := np.flatnonzero(axis == k)):
+                yield f"{name}_m", "m", at, values[at]
         return
     # The system of the files needs all three coordinates.
     row = np.full((int(who.max(initial=-1)) + 1, 3), -1)
     row[who, axis] = np.arange(len(who))
     row = row[(row >= 0).all(axis=1)]
+    if not len(row):
+        return
     on_map = block.frame.map.map(values[row])
     views = [] if block.frame.map.geographic else [(tuple(f"{name}_m" for name in AXES), on_map)]
     for names, there in [*views, (_PLACE, block.frame.map.place(on_map))]:
