@@ -93,13 +93,15 @@ def rounded_columns(adjusted: Adjustment, redundancy: Redundancy) -> list[Rounde
             sigma = float(np.median(column.sigma))
             if step := rounding_step(column.values, sigma, column.unit):
                 key = column.rows.tobytes()
-                steps[key] = max(steps.get(key, (0.0,)), (step / sigma, step, sigma, column), key=lambda c: c[0])  # type: ignore[assignment]
+                if key not in steps or step / sigma > steps[key][0]:
+                    steps[key] = (step / sigma, step, sigma, column)
         for _, step, sigma, column in steps.values():
             of, numbers = v[column.rows], r[column.rows]
             vpv, total = float((of**2).sum()), float(numbers.sum())
             if vpv < _EXACT * float((numbers**2 * rounding_error(step) ** 2 / column.sigma**2).sum()):
                 continue
-            w = np.abs(of / np.sqrt(numbers))[numbers > LEAST_CHECKED]
+            checked = numbers > LEAST_CHECKED
+            w = np.abs(of[checked]) / np.sqrt(numbers[checked])
             exceeded = len(w) > 0 and len(w) * chi_square_tails(float(w.max(initial=0.0)) ** 2, 1)[1] < _LEVEL
             exceeded |= total >= 1 and vpv > total and chi_square_tails(vpv, total)[1] < _LEVEL
             found.append(RoundedColumn(group, column.name, column.unit, len(of), step, sigma, exceeded))
@@ -132,7 +134,7 @@ def small_sigmas(adjusted: Adjustment) -> list[SmallSigma]:
 def _groups(adjusted: Adjustment) -> Iterator[tuple[str, AbstractObservations]]:
     """Yield the observed groups of the block with residuals, by name."""
     named = adjusted.residuals.named
-    yield from ((name, rows) for name, rows in adjusted.block.named_observations.items() if name in named)
+    yield from ((name, rows) for name, rows in adjusted.block.named_observations.items() if len(rows) and name in named)
 
 
 def _columns(block: Block, table: str, rows: AbstractObservations) -> Iterator[_Column]:
