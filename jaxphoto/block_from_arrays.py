@@ -84,6 +84,10 @@ def block_fields(
     bars = CheckedColumns("distances", distances, "point_a", "point_b", "distance_m")
     ends = [bars.index(end, ids, "point {name} is measured in no image") for end in ("point_a", "point_b")]
 
+    attitude_sigma = turned.sigmas(_SIGMA_ATTITUDE, "sigma_deg")
+    turned.warn_of_32_bits(_ATTITUDE, attitude_sigma)
+    distance_sigma = bars.sigmas(("sigma_m",), "sigma_m")
+    bars.warn_of_32_bits(("distance_m",), distance_sigma)
     start, known = _start(ids, CheckedColumns("points", points, "point", *_XYZ), by_role["control"], by_role["fixed"])
     placed = set(_XYZ + _ANGLES) <= set(listed.columns)
     position, angles = (listed.numbers(*c) if placed else np.zeros((len(names), 3)) for c in (_XYZ, _ANGLES))
@@ -113,12 +117,12 @@ def block_fields(
         "attitudes": Attitudes(
             of_attitude,
             as_jax_array(np.deg2rad(turned.numbers(*_ATTITUDE))),
-            as_jax_array(np.deg2rad(turned.sigmas(_SIGMA_ATTITUDE, "sigma_deg"))),
+            as_jax_array(np.deg2rad(attitude_sigma)),
         ),
         "distances": Distances(
             np.stack(ends, axis=1),
             as_jax_array(bars.numbers("distance_m")[:, 0]),
-            as_jax_array(bars.sigmas(("sigma_m",), "sigma_m")[:, 0]),
+            as_jax_array(distance_sigma[:, 0]),
         ),
         "datum": datum or Datum("control" if given.n or flown.n else "minimal"),
         "start": Start(unknowns, np.full(len(names), placed), known),
@@ -146,6 +150,7 @@ def _image_rows(
     points = tuple(dict.fromkeys(ids))
     point = seen.index("point", points, "")
     xy, sigma = seen.numbers("x_mm", "y_mm"), seen.sigmas(("sigma_x_mm", "sigma_y_mm"), "sigma_mm", sigma_mm)
+    seen.warn_of_32_bits(("x_mm", "y_mm"), sigma)
     order = np.lexsort((image, point))
     for k in np.flatnonzero((np.diff(image[order]) == 0) & (np.diff(point[order]) == 0)):
         again = max(order[k], order[k + 1])
@@ -173,6 +178,7 @@ def _scalars(
     there = ~np.isnan(value)
     needed = there if observed is None else there & observed[:, None]
     sigma = table.sigmas(_SIGMA_XYZ, "sigma_m", needed=needed)
+    table.warn_of_32_bits(_XYZ, sigma)
     entry, axis = np.nonzero(there)
     return kind(who[entry], axis, as_jax_array(value[there]), as_jax_array(sigma[there])), entry
 

@@ -1,16 +1,20 @@
 """Point cloud of a laser scanner."""
 
 import dataclasses
+import warnings
 from collections.abc import Sequence
 
 import equinox as eqx
 import numpy as np
 from jaxtyping import Bool, Float, Int, UInt8
 
+from jaxphoto.rounding import float_step
 from jaxphoto.short_repr import pretty_repr
 
 OF_POINTS = ("xyz", "classification", "returns", "time", "strip", "withheld")
 """Point-wise fields of a `Cloud`."""
+PRECISION_M = 0.01
+"""Standard deviation of precise laser points (m)."""
 
 
 @pretty_repr
@@ -29,6 +33,17 @@ class Cloud(eqx.Module):
     strip: Int[np.ndarray, "n"] | None = None
     strips: tuple[str, ...] = eqx.field(static=True, default=())
     withheld: Bool[np.ndarray, "n"] | None = None
+
+    def __check_init__(self) -> None:
+        for name, values in zip("XYZ", np.asarray(self.xyz).T, strict=True):
+            if step := float_step(values, PRECISION_M):
+                warnings.warn(
+                    f"Cloud.xyz, column {name}: {values.dtype} has steps of {step:.2g} m at "
+                    f"{np.abs(values).max():.7g} m, laser points are precise to {PRECISION_M:g} m; give float64 "
+                    "computed from the original numbers",
+                    UserWarning,
+                    stacklevel=3,
+                )
 
     def __len__(self) -> int:
         return len(self.xyz)

@@ -1,5 +1,6 @@
 """Checked columns of a table in memory; errors name table, column and entry."""
 
+import warnings
 from collections.abc import Iterator, Sequence
 from typing import Any, Protocol, runtime_checkable
 
@@ -7,6 +8,7 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxphoto.errors import InputError
+from jaxphoto.rounding import float_step
 
 
 @runtime_checkable
@@ -74,6 +76,19 @@ class CheckedColumns:
         for entry, k in np.argwhere(needed & ~(values > 0)):
             raise self.wrong(entry, f"the standard deviation {columns[k]} is {values[entry, k]}; it must be positive")
         return np.where(needed, values, 0.0)
+
+    def warn_of_32_bits(self, columns: Sequence[str], sigmas: Float[np.ndarray, "n k"]) -> None:
+        """Warn of columns of 32-bit numbers whose step is not small compared with their smallest standard deviation."""
+        for k, name in enumerate(columns):
+            values, sigma = self.columns.get(name, np.zeros(0)), sigmas[:, k][sigmas[:, k] > 0]
+            if len(sigma) and (step := float_step(values, float(sigma.min()))):
+                warnings.warn(
+                    f"{self.name}, column {name}: {values.dtype} has steps of {step:.2g} at "
+                    f"{np.nanmax(np.abs(values)):.7g}, sigma is {sigma.min():.2g}; give float64 computed from the "
+                    "original numbers",
+                    UserWarning,
+                    stacklevel=4,
+                )
 
     def index(self, column: str, known: Sequence[str], message: str) -> Int[np.ndarray, "n"]:
         """Return the index of each name of a column in `known`; see `find`."""

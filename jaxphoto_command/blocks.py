@@ -103,7 +103,7 @@ def adjust(
         tables = jaxphoto.Tables(adjusted, rotations, read_truth(block))  # type: ignore[arg-type]
         findings = report.snooped_findings(snooped, read) if snooped else []
         findings += report.component_findings(components, masked, stated) if components else []
-        verdict = report.Verdict.of([*findings, *report.verdict_of(tables).findings])
+        verdict = report.verdict_of(tables, findings)
         progress.update(f"writing {out}")
         times = adjusted.seconds | seconds
         times = {name: times[name] for name in ("read", "start", "compile", "solve", "covariance") if name in times}

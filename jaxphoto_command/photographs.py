@@ -203,7 +203,6 @@ def control(
     from jaxphoto.procedures.control import at_optimum, control_block, retest
     from jaxphoto.procedures.weights import estimate_weights
     from jaxphoto.report import Tables, component_findings, component_tables, verdict_of
-    from jaxphoto.report.findings import Verdict
     from jaxphoto.report.page import versions
     from jaxphoto.report.photographs import control_findings, control_summary, write_control
     from jaxphoto.report.results import write_results, write_summary
@@ -227,7 +226,7 @@ def control(
         progress.update("computing statistics")
         tables, adjusted = Tables(result.adjusted), result.adjusted
         weights = component_findings(components, stated=stated) if components else []
-        verdict = Verdict.of([*weights, *verdict_of(tables).findings, *control_findings(result)])
+        verdict = verdict_of(tables, [*weights, *control_findings(result)])
         progress.update(f"writing {out}")
         images = adjusted.block.images
         times = {name: adjusted.seconds[name] for name in ("compile", "solve", "covariance")}

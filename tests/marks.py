@@ -55,6 +55,7 @@ QUICK = {
         "initial/test_resection.py",
     ),
     "procedures": ("procedures/test_orient_parts.py",),
+    "rounding": ("test_rounding.py",),
     "report": (
         "report/test_culprits.py::test_blunders_are_named_the_largest_first",
         "report/test_plots.py::test_ellipses_are_where_the_quadratic_form_is_one",

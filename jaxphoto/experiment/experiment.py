@@ -2,6 +2,7 @@
 
 import dataclasses
 import importlib.util
+import io
 from collections.abc import Callable, Iterator, Mapping
 from itertools import count
 from pathlib import Path
@@ -14,6 +15,7 @@ from jaxphoto.adjustment import PaddedSizes, common_sizes
 from jaxphoto.block import Block
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.io.recipe import recipe_from
+from jaxphoto.io.text_files import read_text
 from jaxphoto.io.toml import read_toml
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.report import Tables
@@ -196,7 +198,12 @@ def read_published(folder: Path) -> pd.DataFrame:
     path = folder / "published.csv"
     if not path.is_file():
         return pd.DataFrame(columns=PUBLISHED)
-    table = pd.read_csv(path, dtype={"row": str, "column": str, "note": str}, keep_default_na=False, na_values=[""])
+    table = pd.read_csv(
+        io.StringIO(read_text(path)),
+        dtype={"row": str, "column": str, "note": str},
+        keep_default_na=False,
+        na_values=[""],
+    )
     if missing := [name for name in PUBLISHED if name not in table.columns]:
         raise InputError(f"{path}: the column {missing[0]} is missing; add it ({', '.join(PUBLISHED)} are needed)")
     for first in table[table.duplicated(_KEY)][_KEY].itertuples(index=False):

@@ -22,7 +22,7 @@ from jaxphoto.io.block_folder.camera_section import Camera, camera_section, know
 from jaxphoto.io.block_folder.settings import read_settings
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.result_tables import SUMMARY, read_summary, reservation
-from jaxphoto.io.text_files import read_json, read_legacy_text
+from jaxphoto.io.text_files import read_json, read_text
 from jaxphoto.io.text_tables import LARGEST, read_csv
 from jaxphoto.io.toml import Section, read_toml, toml_text
 from jaxphoto.unknowns import FIXED
@@ -72,11 +72,8 @@ class CameraSource(NamedTuple):
         return InputError(f"{self.path}: {message}")
 
     def text(self) -> str:
-        """Read the text, UTF-8 or else Windows-1252. Raise InputError for a binary file."""
-        text = read_legacy_text(self.path)
-        if "\0" in text:
-            raise self.error("the file is not a text file; give a camera file")
-        return text
+        """Read the text. Raise InputError for a binary file."""
+        return read_text(self.path)
 
     def number(self, name: str, text: Any) -> float:
         """Parse a finite number in the file. Raise InputError for other text."""

@@ -16,12 +16,13 @@ from pyproj.crs import CompoundCRS
 from pyproj.exceptions import CRSError
 
 from jaxphoto.block import Frame
-from jaxphoto.cloud import Cloud
+from jaxphoto.cloud import PRECISION_M, Cloud
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.datum_change import ways
 from jaxphoto.georeferencing.map_frame import MapFrame, map_system
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.optional import extra
+from jaxphoto.rounding import rounding_error, rounding_step
 from jaxphoto.writing import whole_file
 
 if TYPE_CHECKING:
@@ -65,7 +66,15 @@ def read_cloud(
     path = Path(path)
     placement = cloud_placement(path, frame, epsg)
     parts, extents = [], []
-    for chunk in _chunks(path):
+    for k, chunk in enumerate(_chunks(path)):
+        step = rounding_step(chunk.xyz[:, 2], PRECISION_M, "m") if k == 0 else 0.0
+        if rounding_error(step) > PRECISION_M:
+            warnings.warn(
+                f"{path.name}, column Z: all heights are multiples of {step:.4g}, too coarse for laser points precise "
+                f"to {PRECISION_M:g} m; export the cloud with all digits, or state a larger sigma",
+                UserWarning,
+                stacklevel=2,
+            )
         part = placement.placed(chunk)
         mask = np.ones(len(part), bool) if part.withheld is None else ~part.withheld
         if part.classification is not None:

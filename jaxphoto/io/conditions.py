@@ -3,6 +3,7 @@
 DJI writes the serial numbers of camera and drone, and the temperatures of lens and sensor, into XMP.
 """
 
+import io
 import re
 from collections.abc import Collection, Sequence
 from pathlib import Path
@@ -14,6 +15,7 @@ import pandas as pd
 from jaxphoto.camera.conditions import NUMBERS, TEXTS, Conditions
 from jaxphoto.errors import InputError
 from jaxphoto.io.photographs import TAG, Exif, number, open_picture, read_exif, text
+from jaxphoto.io.text_files import read_text
 from jaxphoto.writing import input_file
 
 CONDITIONS = "conditions.csv"
@@ -82,15 +84,14 @@ def write_conditions(conditions: Sequence[Conditions], folder: Path, used: Colle
 
 def read_conditions(path: Path) -> list[Conditions]:
     """Read conditions.csv. Raises InputError for missing columns or an empty table."""
+    content = io.StringIO(read_text(path))
     try:
-        table = pd.read_csv(path, dtype=str, keep_default_na=False)
+        table = pd.read_csv(content, dtype=str, keep_default_na=False)
         numbers = {name: pd.to_numeric(table[name]) for name in NUMBERS if name in table}
         valid = table["sha256"].str.fullmatch("[0-9a-f]{64}") & table["used"].isin(["True", "False"])
         table = table.assign(used=table["used"] == "True")[
             ["image", "file", "sha256", "used", *table.columns.intersection(list(TEXTS))]
         ]
-    except OSError:
-        raise
     except (KeyError, ValueError) as error:
         raise InputError(f"{path.name}: not a table of photographs ({error}); rewrite the results") from None
     if not valid.all() or table.empty:

@@ -14,7 +14,7 @@ import numpy as np
 from jaxphoto.errors import InputError, RowError, quoted
 from jaxphoto.io.text_tables import LARGEST, finite
 
-SYSTEM = re.compile(r"EPSG:\d|\+proj=|WGS84\s+UTM\s", re.IGNORECASE)
+SYSTEM = re.compile(r"EPSG:\d|\+proj=|WGS\s?84(?:\s+UTM\s|\s*$)", re.IGNORECASE)
 """First line of an OpenDroneMap file, which names its coordinate system."""
 PLACE = {
     "x": ("x", "easting", "east", "e", "longitude", "lon", "long"),

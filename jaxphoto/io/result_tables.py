@@ -1,5 +1,6 @@
 """Files of a result folder: tables, summary.json with its verdict, and hashes of the inputs."""
 
+import io
 import os
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
@@ -9,7 +10,7 @@ import pandas as pd
 
 from jaxphoto.errors import InputError
 from jaxphoto.io.block_folder.table_layout import TOML
-from jaxphoto.io.text_files import read_json
+from jaxphoto.io.text_files import read_json, read_text
 from jaxphoto.io.text_tables import read_csv
 from jaxphoto.io.toml import read_toml
 from jaxphoto.writing import InputFile, input_file
@@ -47,9 +48,10 @@ def read_truth(folder: str | Path) -> dict[str, pd.DataFrame]:
 
 def read_table(path: Path) -> pd.DataFrame:
     """Read one result table. Raises InputError for an invalid file."""
+    content = io.StringIO(read_text(path))
     try:
-        return pd.read_csv(path, dtype=_TEXT, keep_default_na=False, na_values=[""])
-    except (ValueError, UnicodeDecodeError) as error:
+        return pd.read_csv(content, dtype=_TEXT, keep_default_na=False, na_values=[""])
+    except ValueError as error:
         raise InputError(f"{path.name} cannot be read as a table: {' '.join(str(error).split())}") from error
 
 

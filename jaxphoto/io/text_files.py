@@ -1,6 +1,8 @@
-"""Read whole files: bytes, UTF-8 text and JSON objects."""
+"""Read whole files: bytes, text and JSON objects."""
 
+import codecs
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -9,6 +11,7 @@ from jaxphoto.errors import InputError
 # Maximum number of bytes searched for words that identify a format.
 _HEAD = 2_000_000
 # First bytes of spreadsheet workbooks: ZIP archive, and the older binary format.
+_DECLARED = re.compile(rb"\s*<\?xml[^>]*?\bencoding=[\"']([\w.-]+)")
 _WORKBOOK = (b"PK\x03\x04", b"\xd0\xcf\x11\xe0")
 
 
@@ -25,25 +28,31 @@ def read_bytes(path: Path) -> bytes:
 
 
 def read_text(path: Path) -> str:
-    """Read a UTF-8 file, normalising line ends and removing the byte order mark. Raises InputError if invalid."""
+    """Read a text file in any encoding of `decoded`. Raises InputError for workbooks and other binary files."""
     content = read_bytes(path)
     if content.startswith(_WORKBOOK):
         raise InputError(f"{path.name} is a workbook (xlsx, ods) or another archive; save the sheet as CSV, UTF-8")
-    try:
-        return content.decode("utf-8-sig").replace("\r\n", "\n").replace("\r", "\n")
-    except UnicodeDecodeError as error:
-        row = error.object[: error.start].count(b"\n") + 1
-        raise InputError(
-            f"{path.name}, row {row}: the text is not UTF-8; save the file as UTF-8 (in a spreadsheet: CSV UTF-8)"
-        ) from None
+    text = decoded(content)
+    if "\0" in text:
+        raise InputError(f"{path.name} is not a text file; save it as text, UTF-8")
+    return text
 
 
-def read_legacy_text(path: Path) -> str:
-    """Read a text file of another program, UTF-8 or else Windows-1252, normalising line ends."""
-    content = read_bytes(path)
-    try:
-        text = content.decode("utf-8-sig")
-    except UnicodeDecodeError:
+def decoded(content: bytes) -> str:
+    """Decode text, normalise line ends and remove the byte order mark.
+
+    UTF-16 is recognised by its byte order mark. Other text is UTF-8 or, if it is not valid UTF-8, in the encoding that
+    an XML file declares, or else Windows-1252, which includes the printable characters of Latin-1.
+    """
+    declared = [match[1].decode() for match in [_DECLARED.match(content)] if match]
+    utf = "utf-16" if content.startswith((codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)) else "utf-8-sig"
+    for encoding in (utf, *declared):
+        try:
+            text = content.decode(encoding)
+            break
+        except (UnicodeDecodeError, LookupError):
+            continue
+    else:
         text = content.decode("cp1252", "replace")
     return text.replace("\r\n", "\n").replace("\r", "\n")
 
@@ -66,5 +75,5 @@ def has_words(path: Path, *words: str) -> bool:
     if not path.is_file():
         return False
     with path.open("rb") as file:
-        head = file.read(_HEAD)
-    return all(word.encode() in head for word in words)
+        head = decoded(file.read(_HEAD))
+    return all(word in head for word in words)

@@ -6,6 +6,7 @@ rotated by the wander angle: true heading = platform heading - wander angle (Fil
 Naval Oceanographic Office). SBET has no standard deviations.
 """
 
+import warnings
 from pathlib import Path
 from typing import NamedTuple
 
@@ -28,6 +29,7 @@ from jaxphoto.rotation import (
     quaternion_from_matrix,
     roll_pitch_yaw_from_matrix,
 )
+from jaxphoto.rounding import M_PER_DEGREE, rounding_error, rounding_step
 
 FIELDS = (
     "time", "latitude", "longitude", "altitude", "x_velocity", "y_velocity", "z_velocity", "roll", "pitch",
@@ -37,6 +39,9 @@ FIELDS = (
 """Fields of an SBET record; units s, rad, m, m/s, m/s^2, rad/s."""
 _SBET = np.dtype("<f8")
 _RECORD_BYTES = len(FIELDS) * _SBET.itemsize
+# Deviation from interpolated values, as a fraction of the step, that rounding causes; maximum fraction of such records
+# in tracks that are not rounded.
+_OFF, _UNEVEN = 0.1, 0.02
 _MAP = ("X_m", "Y_m", "Z_m")
 _PLACE = ("longitude_deg", "latitude_deg", "height_m")
 _ANGLES = ("roll_deg", "pitch_deg", "yaw_deg")
@@ -216,11 +221,48 @@ def positions_in(records: Records, frame: Frame) -> Float[np.ndarray, "records 3
 def trajectory_in(
     records: Records, frame: Frame, sigma_m: Float[np.ndarray, "records 3"], sigma_rad: Float[np.ndarray, "records 3"]
 ) -> Trajectory:
-    """Transform a trajectory to the frame of a block, with the given standard deviations."""
+    """Transform a trajectory to the frame of a block, with the given standard deviations.
+
+    Warns of columns rounded to a step whose error exceeds their standard deviation.
+    """
     position = positions_in(records, frame)
+    _warn_of_rounding(records, sigma_m, np.rad2deg(sigma_rad))
     axes = _frame_from_axes(records, frame, position)
     quaternion = _quaternions(axes, np.deg2rad(records.roll_pitch_yaw_deg))
     return Trajectory(*map(jnp.asarray, (records.time, position, quaternion, sigma_m, sigma_rad)))
+
+
+def _warn_of_rounding(
+    records: Records, sigma_m: Float[np.ndarray, "records 3"], sigma_deg: Float[np.ndarray, "records 3"]
+) -> None:
+    names = (*(_PLACE if records.geographic else _MAP), *_ANGLES)
+    values = np.hstack([records.coordinates, records.roll_pitch_yaw_deg])
+    for name, column, sigma in zip(names, values.T, np.hstack([sigma_m, sigma_deg]).T, strict=True):
+        unit, limit = name.rsplit("_", 1)[1], float(np.median(sigma))
+        if name in _PLACE[:2]:
+            limit /= M_PER_DEGREE
+        step = rounding_step(column, limit, unit)
+        if rounding_error(step) > limit and not _is_smooth(records.time, column, step):
+            warnings.warn(
+                f"{records.file}, column {name}: all values are multiples of {step:.6g} {unit}, sigma is {limit:.2g} "
+                f"{unit}; give them with all their digits, or a larger sigma",
+                UserWarning,
+                stacklevel=3,
+            )
+
+
+def _is_smooth(time: Float[np.ndarray, "n"], values: Float[np.ndarray, "n"], step: float) -> bool:
+    """Return True if nearly all values are interpolated by a cubic through their four neighbours: exact tracks are
+    multiples of their steps without being rounded.
+    """
+    k = np.arange(2, len(time) - 2)[:, None]
+    j = k + np.array([-2, -1, 1, 2])
+    x = time[j] - time[k]
+    # Lagrange weights at the time between.
+    others = [np.delete(x, m, axis=1) for m in range(4)]
+    weights = np.stack([(o / (o - x[:, [m]])).prod(axis=1) for m, o in enumerate(others)], axis=1)
+    off = np.abs(values[k[:, 0]] - (weights * values[j]).sum(axis=1))
+    return bool((off > _OFF * step).sum() <= _UNEVEN * len(off))
 
 
 def records_of(trajectory: Trajectory, file: str) -> Records:

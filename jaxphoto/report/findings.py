@@ -23,7 +23,7 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 COLOURS: dict[Severity, str] = {"error": "red", "warning": "amber", "note": "green"}
 MARKS: dict[Severity, str] = {"error": "!!", "warning": "!", "note": "-"}
 # Findings before others of their severity.
-_FIRST = ("weights", "common_bias", "external_reliability")
+_FIRST = ("weights", "rounded", "small_sigma", "common_bias", "external_reliability")
 _DECLARED: dict[str, dict[str, str]] = tomllib.loads(
     (files("jaxphoto.report") / "templates" / "findings.toml").read_text(encoding="utf-8")
 )

@@ -19,6 +19,7 @@ from jaxphoto.procedures.snooping import SEVERAL, InflatedComponent, Snooped, mo
 from jaxphoto.report.findings import SEVERITIES, Finding, Severity, p_words
 from jaxphoto.report.formatting import in_file_unit, plus_minus, symbol
 from jaxphoto.report.tables import Tables
+from jaxphoto.statistics.input_precision import rounded_columns, small_sigmas
 from jaxphoto.unknowns import Weighted
 
 ANOTHER_UNIT = 0.1
@@ -98,6 +99,27 @@ def _signed(value: float, sigma: float) -> str:
 def _is_large(tables: Tables, ratio: float) -> bool:
     """Return True if first-order theory does not give an error of `ratio` a posteriori standard deviations."""
     return ratio * float(tables.adjusted.sigma0) > _LARGE
+
+
+def input_findings(tables: Tables, residual: Sequence[Finding]) -> Iterator[Finding]:
+    """Yield columns of rounded values and standard deviations that no instrument reaches.
+
+    Rounding whose errors exceed the standard deviation is a warning; it is as severe as the worst of the `residual`
+    findings, which it may cause, if the residuals of its column are too large.
+    """
+    worst = min((SEVERITIES.index(f.severity) for f in residual), default=len(SEVERITIES) - 1)
+    for c in rounded_columns(tables.adjusted, tables.redundancy):
+        severity: Severity = "warning" if c.exceeded or c.error > c.sigma else "note"
+        if c.exceeded:
+            severity = SEVERITIES[min(worst, SEVERITIES.index(severity))]
+        numbers = {"n": c.n, "unit": c.unit, "error": c.error}
+        numbers["cause"] = " and may cause the findings below" if c.exceeded and residual else ""
+        hint = "Its sigma must include that error" if severity == "note" else ""
+        yield Finding("rounded", severity, f"{c.table}, column {c.column}", c.step, c.sigma, hint, numbers)
+    for s in small_sigmas(tables.adjusted):
+        subject = f"{s.table}, sigma of {', '.join(s.axes)}" if s.axes else f"{s.table}, sigma"
+        numbers = {"n": s.n, "total": s.total, "unit": s.unit}
+        yield Finding("small_sigma", "warning", subject, s.sigma, s.limit, numbers=numbers)
 
 
 def contradictions(tables: Tables) -> Iterator[Finding]:
@@ -469,6 +491,7 @@ def component_findings(
         found.append(Finding("components_not_converged", "warning", value=components.iterations))
     elif stated is not None and components.supported.any():
         found.append(_estimated_weights(components, stated))
+        found += input_findings(Tables(stated), found)
     return found + [Finding("component", "warning", sentence) for sentence in components.warnings.values()]
 
 

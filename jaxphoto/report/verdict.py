@@ -1,7 +1,7 @@
 """Verdict on an adjustment: findings on convergence, residuals, geometry and reliability."""
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import equinox as eqx
@@ -18,7 +18,13 @@ from jaxphoto.initial.approximate import in_front, looking_away
 from jaxphoto.procedures.adjust import left_out_words
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
 from jaxphoto.report.formatting import of_sigma, path_words, plus_minus, symbol
-from jaxphoto.report.residual_findings import NOTHING_FITS, reliability_findings, residual_findings, stretch_findings
+from jaxphoto.report.residual_findings import (
+    NOTHING_FITS,
+    input_findings,
+    reliability_findings,
+    residual_findings,
+    stretch_findings,
+)
 from jaxphoto.report.tables import NEAR_VERTICAL, Tables
 from jaxphoto.statistics import (
     SIGNIFICANCE_LEVEL,
@@ -60,9 +66,13 @@ _C, _POINT = ("c_mm",), ("xp_mm", "yp_mm")
 _OFF_MIDDLE, _C_RATIO = 0.05, 1.25
 
 
-def verdict_of(tables: Tables) -> Verdict:
-    """Assess an adjustment: convergence, residuals, weak geometry, correlations, significance, reliability."""
-    return Verdict.of(_findings(tables))
+def verdict_of(tables: Tables, more: Sequence[Finding] = ()) -> Verdict:
+    """Assess an adjustment: convergence, residuals, weak geometry, correlations, significance, reliability.
+
+    `more`: findings on the steps before; they replace findings of the same code and subject.
+    """
+    known = {(f.code, f.subject) for f in more}
+    return Verdict.of([*more, *(f for f in _findings(tables) if (f.code, f.subject) not in known)])
 
 
 def _findings(tables: Tables) -> Iterator[Finding]:
@@ -78,7 +88,9 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     yield from behind_findings(adjusted)
     yield from looking_up_findings(tables)
     yield from format_findings(adjusted)
-    yield from residual_findings(tables)
+    residual = list(residual_findings(tables))
+    yield from input_findings(tables, residual)
+    yield from residual
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))
     for camera, c in tables.correlations.items():

@@ -5,9 +5,10 @@ from pathlib import Path
 
 import pytest
 
-from jaxphoto.extras.formats import CAMERAS_WRITTEN, CONTROL_FORMATS, EXPORTS, FORMATS, export, recognise
+from jaxphoto.extras.formats import CAMERAS_WRITTEN, CONTROL_FORMATS, EXPORTS, FORMATS, export, read_source, recognise
 from jaxphoto.io import exposures
 from jaxphoto.io.camera_files import CAMERA_READERS
+from jaxphoto.io.text_files import decoded
 from jaxphoto.io.trajectory import is_sbet
 from tests import sound_files
 from tests.io import (
@@ -120,27 +121,82 @@ CONTROL = {"gcp_list": control_files.GCP_LIST, "metashape": control_files.MARKER
 TABLES = (control_files.REFERENCE, control_files.PIX4D, control_files.PIX4D_MARKS, control_files.OWN)
 
 
+OTHERS = {
+    "image_points.txt": oriented_files.text_of_points(oriented_files.inside("opencv", "local"), oriented_files.BINGO),
+    "trajectory.csv": "time_s,X_m,Y_m,Z_m,roll_deg,pitch_deg,yaw_deg\n1,2,3,4,5,6,7\n2,2,3,4,5,6,7\n",
+    "cloud.csv": "X_m,Y_m,Z_m\n1,2,3\n2,3,4\n",
+    "points.txt": "x y z\n1 2 3\n2 3 4\n",
+    "note.txt": "flown in May\nwith two batteries\n",
+}
+"""Text files that none of these readers reads."""
+
+
 def _folder(source):
     """The folder in which a writer put the project."""
     return source / "out" if (source / "out").is_dir() else source
 
 
+def _claims(path):
+    """The project, camera and control formats that claim a file."""
+    text = decoded(path.read_bytes())
+    return [
+        recognise(path),
+        [name for name, reader in CAMERA_READERS.items() if reader.recognise(path, text)],
+        [name for name, format in CONTROL_FORMATS.items() if format.recognise(path, text)],
+    ]
+
+
+# Programs that write several kinds of content into one file, by the names of their formats.
+SAME_PROGRAM = [{"metashape", "agisoft"}]
+
+
 @pytest.mark.parametrize("name", FORMATS)
 def test_every_project_is_recognised_by_its_format_alone(tmp_path, name):
+    """As a folder and by its main file; a camera or control format may claim that file only for its own content."""
     for k, write in enumerate(PROJECTS[name]):
         (tmp_path / str(k)).mkdir()
         write(tmp_path / str(k))
-        assert recognise(_folder(tmp_path / str(k))) == [name]
+        folder = _folder(tmp_path / str(k))
+        assert recognise(folder) == [name]
+        (main,) = FORMATS[name].find(folder)
+        projects, cameras, control = _claims(main)
+        assert projects == [name]
+        for others in (cameras, control):
+            assert all(other == name or {name, other} in SAME_PROGRAM for other in others), (main, others)
 
 
-def test_every_camera_and_control_file_is_recognised_by_its_format_alone(tmp_path):
-    assert CAMERAS.keys() == CAMERA_READERS.keys() and CONTROL.keys() == CONTROL_FORMATS.keys()
-    for name, (file, text) in CAMERAS.items():
-        assert [key for key, reader in CAMERA_READERS.items() if reader.recognise(Path(file), text)] == [name]
-        assert recognise(tmp_path) == []
-    path = tmp_path / "a"
-    for name, text in [*CONTROL.items(), *(("", text) for text in TABLES)]:
-        path.write_text(text, encoding="utf-8")
-        names = [key for key, format in CONTROL_FORMATS.items() if format.recognise(path, text)]
-        assert names == ([name] if name else [])
-        assert recognise(path) == (["metashape"] if name == "metashape" else [])
+@pytest.mark.parametrize("name", CAMERA_READERS)
+def test_every_camera_is_recognised_by_its_format_alone(tmp_path, name):
+    file, text = CAMERAS[name]
+    (tmp_path / file).write_text(text, encoding="utf-8")
+    assert _claims(tmp_path / file) == [[], [name], []]
+    assert recognise(tmp_path) == []
+
+
+@pytest.mark.parametrize("name", CONTROL_FORMATS)
+def test_every_control_file_is_recognised_by_its_format_alone(tmp_path, name):
+    path = tmp_path / "a.txt"
+    path.write_text(CONTROL[name], encoding="utf-8")
+    projects, cameras, control = _claims(path)
+    assert (cameras, control) == ([], [name]) and projects in ([], [name])
+
+
+@pytest.mark.parametrize("text", [*TABLES, *OTHERS])
+def test_other_texts_are_recognised_by_none(tmp_path, text):
+    path = tmp_path / (text if text in OTHERS else "a.txt")
+    path.write_text(OTHERS.get(text, text), encoding="utf-8")
+    assert _claims(path) == [[], [], []]
+
+
+@pytest.mark.filterwarnings("ignore:.*fewer than")
+@pytest.mark.parametrize("encoding", ["utf-8", "cp1252", "utf-16"])
+@pytest.mark.parametrize("name", [*sorted(FORMATS.keys() & EXPORTS.keys() - {"bal"}), "opk"])
+def test_names_that_are_not_ascii_are_read_in_every_encoding(tmp_path, name, encoding):
+    p = oriented_files.inside("opencv", "local")
+    named = [[f"Flüge/{name.replace(' ', '_')}" for name in names] for names in (p.files, p.images)]
+    p = p._replace(files=tuple(named[0]), images=named[1])
+    export(p, tmp_path / "out", name)
+    for path in (tmp_path / "out").iterdir():
+        path.write_text(path.read_text(encoding="utf-8"), encoding=encoding)
+    images = read_source(tmp_path / "out").images
+    assert len(images) == 4 and all("ü" in image for image in images), images

@@ -22,7 +22,7 @@ CASES = {
     "column twice": ([(S, "Y_m,Z_m", "X_m,Z_m")], ["stations.csv, row 1", "X_m", "keep one"]),
     "decimal commas": ([(S, "10.0,0.0,100.0,", "10,0,0,0,100,0,")], ["stations.csv, row 3", "remove", "semicolons"]),
     "open quotation": ([(S, "b,10.0", '"b,10.0')], ["stations.csv, row 3", "quotation", "close"]),
-    "not UTF-8": ([(S, "b,10.0", "\udcff,10.0")], ["stations.csv, row 3", "UTF-8", "save"]),
+    "not text": ([(S, "b,10.0", "\0,10.0")], ["stations.csv", "not a text file", "save"]),
     "workbook": ([(S, "", "PK\x03\x04\n")], ["stations.csv", "workbook", "save the sheet"]),
     # numbers
     "no number": ([(P, "1.15,0.2", "l.15,0.2")], ["image_points.csv, row 8", "l.15", "write it like"]),

@@ -18,9 +18,19 @@ def test_text_of_any_line_ends(tmp_path):
     path = tmp_path / "a"
     path.write_bytes("\ufeffö\r\nb\rc\n".encode())
     assert read_text(path) == "ö\nb\nc\n"
-    path.write_bytes(b"a\nb\n\xff\n")
-    with pytest.raises(InputError, match="a, row 3: the text is not UTF-8"):
+    path.write_bytes(b"PK\x03\x04")
+    with pytest.raises(InputError, match="a is a workbook"):
         read_text(path)
+    path.write_bytes(b"a\0\xff\n")
+    with pytest.raises(InputError, match="a is not a text file"):
+        read_text(path)
+    for text, encoding in (
+        ("Höhe – 12 €", "cp1252"), ("Höhe 12 °", "latin-1"), ("Höhe ж", "utf-16"), ("Höhe ж", "utf-8"),
+        ("\ufeffВысота", "utf-16-be"), ('<?xml version="1.0" encoding="cp1251"?><Высота/>', "cp1251"),
+        ('<?xml version="1.0" encoding="unknown"?><Höhe/>', "cp1252"),
+    ):  # fmt: skip
+        path.write_bytes(text.encode(encoding))
+        assert read_text(path) == text.removeprefix("\ufeff")
     for place, words in ((tmp_path, "is a folder"), (tmp_path / "none", "not found"), (path / "below", "not found")):
         with pytest.raises(InputError, match=words):
             read_bytes(place)

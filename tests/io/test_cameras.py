@@ -385,7 +385,7 @@ def test_wrong_use_is_refused(tmp_path):
     with pytest.raises(InputError, match=r"contains none of interior.csv, block.toml, camera.toml, cameras.txt"):
         read_camera_file(tmp_path)
     (tmp_path / "b.yml").write_bytes(b"\xff\xfe\x00")
-    with pytest.raises(InputError, match="the file is not a text file"):
+    with pytest.raises(InputError, match="is not a text file"):
         read_camera_file(tmp_path / "b.yml")
     path = written(tmp_path, OPENCV, "a.yml")
     with pytest.raises(InputError, match="image size is 1280 x 960 px, not 100 x 100"):

@@ -44,6 +44,35 @@ def test_a_gcp_list_that_is_to_be_marked_has_points_alone(tmp_path, row):
     assert np.isnan(points.coordinates[:, 2]).all() == ("nan" in row)
 
 
+LISTED = "16.6 59.3 62.6 2799.29 2159.83 a.JPG\n16.61 59.3 62.6 1676.11 2488.37 b.JPG\n"
+
+
+@pytest.mark.parametrize(
+    ("system", "code"),
+    [
+        ("WGS84\t", 4326), ("wgs 84", 4326), ("EPSG:4326", 4326), ("WGS84 UTM 33N", 32633),
+        ("WGS 84 / UTM zone 33N", 32633),
+        ("+proj=utm +zone=33 +datum=WGS84 +units=m +no_defs", 32633), ("local", None),
+    ],
+)  # fmt: skip
+def test_a_gcp_list_in_every_form_of_its_system(tmp_path, system, code):
+    points, marks = read(tmp_path, f"{system}\n{LISTED}")
+    assert system_of(points.system, "a").code == code and marks.image == ("a.JPG", "b.JPG")
+    np.testing.assert_array_equal(points.coordinates[0], (16.6, 59.3, 62.6))
+
+
+def test_a_gcp_list_without_a_known_system_names_the_line(tmp_path):
+    assert read(tmp_path, LISTED).points.system == ""
+    for system in ("mine", "x y z im_x im_y image"):
+        with pytest.raises(InputError, match=f"a, row 2: '{system}' is not a coordinate system; write EPSG"):
+            read(tmp_path, f"# of May\n{system}\n{LISTED}")
+
+
+def test_a_table_with_its_system_in_the_first_line(tmp_path):
+    points = read(tmp_path, "EPSG:32633\nG1,386800.5,6175010.2,30.5\nG2,386800.5,6175020.2,30.5\n").points
+    assert points.system == "EPSG:32633" and points.coordinates[1].tolist() == [386800.5, 6175020.2, 30.5]
+
+
 def test_markers_of_metashape(tmp_path):
     points, marks = read(tmp_path, files.MARKERS)
     assert points.ids == ("point 1", "point 2") and points.check.tolist() == [False, True]
@@ -76,7 +105,7 @@ def test_one_bad_row_of_a_table_without_header_is_named(tmp_path, wrong, words):
     rows = [wrong, *(f"G{k},{k}.0,20.0,30.0,0.02,0.03" for k in range(2, 6))]
     with pytest.raises(InputError, match=words):
         read(tmp_path, "\n".join(rows))
-    with pytest.raises(InputError, match="not a control file"):
+    with pytest.raises(InputError, match="a, row 1: 'who knows what this may be'"):
         read(tmp_path, "\n".join(["who,knows,what,this,may,be", *rows[1:]]))
 
 
@@ -104,7 +133,7 @@ def test_our_own_tables(tmp_path):
     ("points", "marks", "words"),
     [
         ("", None, "the file is empty"),
-        ("hello\nworld\n", None, "not a control file"),
+        ("hello\nworld\n", None, "a, row 1: 'hello' is neither a header nor"),
         (files.OWN_MARKS, None, "has marks but no coordinates"),
         (files.OWN, files.OWN, "has coordinates but no marks"),
         (files.OWN + "G1,1,2,3,,,,\n", None, "row 5: point 'G1' is also in a, row 3 with other coordinates"),

@@ -136,7 +136,6 @@ def test_unknown_formats_list_the_known_ones(tmp_path):
         ("</document>", "", ("project.xml", "line")),
         ("<model>3</model>", "<model>6</model>", ("project.xml", "model '6'", "use one of")),
         ("auto,5.43764", "auto,auto", ("project.xml", "<sensor>", "give width,height")),
-        ('encoding="', 'encoding="X', ("project.xml", "unknown encoding")),
         ("<skew>false</skew>", "<focus>false</focus>", ("project.xml", "focus", "use one of")),
         ("<skew>false</skew>", "<skew>no</skew>", ("project.xml", "<skew>", "use one of true, false")),
         ("im,id,x,y,sxy", "im,id,x,y,s", ("project.xml", "markpts.txt", "add sxy")),

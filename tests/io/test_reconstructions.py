@@ -405,7 +405,6 @@ REFUSED = {
     "track": (lambda f: write_open_sfm(f, version="a.jpg\t10\t1\tx\t0\n"), "row 1: .* is not 2 finite numbers"),
     "mirror": (_blocks(lambda text: re.sub("<M_22>[^<]*<", "<M_22>2.0<", text)), "image .* is not a rotation"),
     "cut": (_blocks(lambda text: text[:-30]), "block.xml: damaged"),
-    "unknown encoding": (_blocks(_replaced("utf-8", "utf-0")), "block.xml: damaged.*unknown encoding: utf-0"),
     "angles": (_blocks(_geographic), "is a geographic system"),
     "axes": (
         _blocks(_replaced("<PrincipalPoint>", "<CameraOrientation>XRightYUp</CameraOrientation><PrincipalPoint>")),

@@ -37,7 +37,7 @@ from jaxphoto.extras.formats.project import (
 )
 from jaxphoto.georeferencing.map_frame import map_system
 from jaxphoto.io.camera_files import CameraSource
-from jaxphoto.io.text_files import has_words, read_bytes
+from jaxphoto.io.text_files import has_words, read_text
 
 FILE = "blocks_exchange.xml"
 _NUMBER = r"\s*([-+]?\d{1,4}(?:\.\d*)?(?:e-\d\d)?)\s*"
@@ -52,7 +52,7 @@ def read(path: Path) -> Project:
     # Parse tie points one by one: as a tree they may take gigabytes.
     xyz: list[list[str | None]] = []
     rows: list[tuple[str, int, list[str | None]]] = []
-    events = ElementTree.iterparse(io.BytesIO(read_bytes(path)), ("start", "end"))
+    events = ElementTree.iterparse(io.StringIO(read_text(path)), ("start", "end"))
     _, root = next(events)
     for event, element in events:
         if event == "end" and element.tag == "TiePoint":

@@ -6,6 +6,7 @@ Pixel coordinates are the same as ours. Its perspective models are special cases
 COLMAP documentation, "Camera models" and "Output format"; src/colmap/sensor/models.h.
 """
 
+import tempfile
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -27,6 +28,7 @@ from jaxphoto.extras.formats.project import (
     translations,
 )
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource
+from jaxphoto.io.text_files import read_bytes, read_text
 from jaxphoto.io.text_tables import is_number
 
 FILES = ("cameras", "images", "points3D")
@@ -88,8 +90,17 @@ def _model(path: Path) -> Any:
     """Read the model of a cameras file."""
     import pycolmap
 
-    model = pycolmap.Reconstruction()
-    (model.read_text if path.suffix == ".txt" else model.read_binary)(str(path.parent))
+    model, images = pycolmap.Reconstruction(), path.with_name("images.txt")
+    if path.suffix != ".txt":
+        model.read_binary(str(path.parent))
+    elif images.is_file() and read_text(images).encode() != read_bytes(images):
+        # pycolmap returns names in UTF-8 only.
+        with tempfile.TemporaryDirectory() as folder:
+            for file in path.parent.glob("*.txt"):
+                Path(folder, file.name).write_text(read_text(file), "utf-8")
+            model.read_text(folder)
+    else:
+        model.read_text(str(path.parent))
     return model
 
 

@@ -5,9 +5,10 @@
                   system: "# EPSG:25832+7837", "#CoordinateSystem: ..." with WKT. Without a header, as in Pix4D: label,
                   coordinates in the axis order of the system, z [, horizontal and vertical accuracy], or image,
                   label, x, y [, accuracy]. Pixel coordinates are the same as ours.
-    gcp_list.txt  a line with the coordinate system, then geo_x geo_y geo_z im_x im_y image_name [gcp_name] [extras];
-                  geo_x is easting or longitude; pixel (0, 0) is at the centre of the upper left pixel. A list without
-                  marks has rows of gcp_name geo_x geo_y geo_z, or of geo_x geo_y geo_z [gcp_name].
+    gcp_list.txt  a line with the coordinate system (WGS84, WGS84 UTM 32N, EPSG:25832, a PROJ string), then geo_x geo_y
+                  geo_z im_x im_y image_name [gcp_name] [extras]; geo_x is easting or longitude; pixel (0, 0) is at the
+                  centre of the upper left pixel. A list without marks has rows of gcp_name geo_x geo_y geo_z, or of
+                  geo_x geo_y geo_z [gcp_name].
 
 Source: OpenDroneMap and OpenSfM documentation, "Ground Control Points".
 """
@@ -33,7 +34,7 @@ from jaxphoto.io.control_table import (
     with_points,
 )
 from jaxphoto.io.text_tables import is_number
-from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
+from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints, system_of
 
 # Our column and row of the centre of the upper left pixel, (0, 0) in gcp_list.txt.
 _FIRST_PX = 0.5
@@ -116,6 +117,8 @@ def read_table(path: Path, text: str) -> SurveyedPoints | Marks:
     comments = [line.strip() for _, line in rows[:_HEAD_LINES] if line.lstrip().startswith("#")]
     content = [(row, line) for row, line in rows if not line.lstrip().startswith("#")]
     systems = [match[1].strip() for line in comments for of in (_EPSG, _WKT) if (match := of.match(line))]
+    if content and SYSTEM.match(content[0][1].strip()):
+        systems = [content.pop(0)[1].strip()]
     system = "".join(systems[:1])
     separator = separator_of(content[0][1] if content else "")
     cells = Cells(
@@ -143,9 +146,14 @@ def read_table(path: Path, text: str) -> SurveyedPoints | Marks:
     odd = [k for k, r in enumerate(records) if len(r) != usual]
     if 2 * len(odd) < len(records) and _without_header([r for r in records if len(r) == usual])[0]:
         raise cells.bad(odd[0], f"{counted(len(records[odd[0]]), 'cell')}, but most rows have {usual}; complete it")
-    raise cells.none(
-        f"not a control file (it begins with {quoted(' '.join(cells.records[0]))}): give points (point, X_m, "
-        "Y_m, Z_m), marks (image, point, x_px, y_px), a gcp_list.txt or markers of Metashape"
+    first, second = cells.records[0], cells.records[min(1, len(cells.records) - 1)]
+    wrong = "is neither a header nor a point nor a mark"
+    if not any(map(is_number, first)) and any(map(is_number, second)):
+        wrong = "is a header without the columns of points or marks"
+    raise cells.bad(
+        0,
+        f"{quoted(' '.join(first))} {wrong}; write the header point, X_m, Y_m, Z_m or image, point, x_px, y_px, or "
+        "give a gcp_list.txt or markers of Metashape",
     )
 
 
@@ -219,11 +227,17 @@ def _gcp_lines(text: str) -> list[tuple[int, str]]:
 
 
 def _is_gcp_list(path: Path, text: str) -> bool:
-    lines = _gcp_lines(text)
-    if not lines or not SYSTEM.match(lines[0][1].strip()):
-        return False
-    cells = lines[1][1].split() if len(lines) > 1 else []
-    return len(lines) == 1 or (len(cells) >= 6 and all(map(is_number, cells[:5]))) or _unmarked(cells) is not None
+    lines = [line.strip() for _, line in _gcp_lines(text)]
+    cells = lines[1].split() if len(lines) > 1 else []
+    if not lines or not SYSTEM.match(lines[0]):
+        # Lists without a system, or with an unknown one, are recognised by the names of photographs.
+        rows = [line.split() for line in lines[:2]]
+        return any(_is_marked(row) and bool(_PICTURE.search(row[5])) for row in rows)
+    return len(lines) == 1 or _is_marked(cells) or _unmarked(cells) is not None
+
+
+def _is_marked(cells: list[str]) -> bool:
+    return len(cells) >= 6 and all(map(is_number, cells[:5]))
 
 
 def _unmarked(cells: list[str]) -> tuple[str, int] | None:
@@ -237,9 +251,12 @@ def _unmarked(cells: list[str]) -> tuple[str, int] | None:
 
 
 def read_gcp_list(path: Path, text: str) -> GivenControl:
-    """Read control points and marks."""
-    (_, system), *rows = _gcp_lines(text)
-    cells = Cells(path.name, [line.split() for _, line in rows], [row for row, _ in rows])
+    """Read control points and marks. Raise InputError for a first line that is not a coordinate system."""
+    lines, system = _gcp_lines(text), ""
+    if not _is_marked(lines[0][1].split()):
+        first, system = lines.pop(0)
+        system_of(system, f"{path.name}, row {first}")
+    cells = Cells(path.name, [line.split() for _, line in lines], [row for row, _ in lines])
     if not cells.records:
         raise cells.none(f"no marks after {quoted(system.strip())}; add rows")
     points, marks, names = SurveyRows(path.name), list[Mark](), dict[str, str]()

@@ -32,7 +32,7 @@ from jaxphoto.io.block_folder import BlockTables, assemble, write_block
 from jaxphoto.io.block_folder.block_reader import read_folder
 from jaxphoto.io.block_folder.table_layout import TOML
 from jaxphoto.io.camera_files import CAMERA_READERS, is_camera_file, joined_notes, reading, write_block_camera
-from jaxphoto.io.text_files import read_legacy_text
+from jaxphoto.io.text_files import decoded, read_bytes, read_text
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 from jaxphoto.writing import check_folder, whole_file, whole_folder
 
@@ -125,7 +125,7 @@ def _format_name(source: Path, name: str | None) -> str:
         return names[0]
     if not names and source.is_file() and is_camera_file(source):
         raise InputError(f"{source} is a camera file, without photographs; jaxphoto camera converts it")
-    if not names and source.is_file() and _control_format(source, read_legacy_text(source)) is not control.TABLES:
+    if not names and source.is_file() and _control_format(source, decoded(read_bytes(source))) is not control.TABLES:
         raise InputError(f"{source} is a control file, without photographs; jaxphoto control adds it to a block")
     what = f"fits several formats ({', '.join(names)})" if names else "has an unknown format"
     raise InputError(f"{source} {what}; give the format, one of {known}")
@@ -285,7 +285,7 @@ def read_control(control: str | Path, marks: str | Path | None = None) -> GivenC
 
 
 def _read_control(path: Path) -> GivenControl | SurveyedPoints | Marks:
-    text = read_legacy_text(path)
+    text = read_text(path)
     chosen = _control_format(path, text)
     with reading(path, chosen.about):
         return chosen.read(path, text)

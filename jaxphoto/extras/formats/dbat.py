@@ -37,7 +37,7 @@ from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.files import Format, beginning, by_content, read_columns, row_numbers, warn
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.block_folder.table_layout import ANGLES, SIGMA_XYZ, XYZ
-from jaxphoto.io.text_files import has_words, read_bytes, read_legacy_text
+from jaxphoto.io.text_files import has_words, read_text
 from jaxphoto.io.text_tables import Table, concatenate, finite, is_number
 
 CAMERA = "camera"
@@ -127,7 +127,7 @@ class _Script(NamedTuple):
 
 
 def _open(path: Path) -> _Script:
-    return _Script(path, ElementTree.fromstring(read_bytes(path)))
+    return _Script(path, ElementTree.fromstring(read_text(path)))
 
 
 def read(path: Path) -> BlockTables:
@@ -336,7 +336,7 @@ def read_export(path: Path) -> BlockTables:
     the datum if there are at least three, otherwise the network is free. The camera has free c, xp, yp and nonzero
     coefficients.
     """
-    lines = read_legacy_text(path).split("\n")
+    lines = read_text(path).split("\n")
     if len(lines) < 6:
         raise InputError(f"{path.name}: the file ends within its header. Export it again")
     camera, at, names = _export_camera(path, lines), 5, dict[str, str]()

@@ -14,7 +14,7 @@ from jaxphoto.errors import InputError, quoted
 from jaxphoto.extras.formats.project import CameraModel, Project
 from jaxphoto.io.block_folder import BlockTables
 from jaxphoto.io.camera_files import CameraReader
-from jaxphoto.io.text_files import read_legacy_text
+from jaxphoto.io.text_files import decoded, read_text
 from jaxphoto.io.text_tables import LARGEST, Table
 from jaxphoto.procedures.control.surveyed import GivenControl, Marks, SurveyedPoints
 
@@ -86,7 +86,7 @@ def warn(message: str) -> None:
 def beginning(path: Path, n_bytes: int) -> list[str]:
     """Return the nonempty lines in the first `n_bytes` of a file."""
     with path.open("rb") as file:
-        return [line for line in file.read(n_bytes).decode("utf-8", "replace").splitlines() if line.strip()]
+        return [line for line in decoded(file.read(n_bytes)).splitlines() if line.strip()]
 
 
 def numbered_lines(text: str) -> list[tuple[int, str]]:
@@ -96,7 +96,7 @@ def numbered_lines(text: str) -> list[tuple[int, str]]:
 
 def content_rows(path: Path) -> list[tuple[int, str]]:
     """Return (row number, line) for each line that is neither empty nor a comment."""
-    return [(row, line) for row, line in numbered_lines(read_legacy_text(path)) if not line.lstrip().startswith("#")]
+    return [(row, line) for row, line in numbered_lines(read_text(path)) if not line.lstrip().startswith("#")]
 
 
 def read_columns(path: Path, columns: Sequence[str]) -> Table:

@@ -53,7 +53,7 @@ from jaxphoto.extras.formats.project import (
 )
 from jaxphoto.extras.formats.texts import points_beside, with_marks, write_image_points
 from jaxphoto.io.camera_files import CameraFile, CameraReader, CameraSource
-from jaxphoto.io.text_files import has_words, read_legacy_text
+from jaxphoto.io.text_files import has_words, read_text
 from jaxphoto.io.text_tables import finite
 from jaxphoto.procedures.control.surveyed import GivenControl, system_of
 
@@ -162,7 +162,7 @@ def read(path: Path) -> Project:
     Positions are in the file's coordinate system; markers are control points there. If there are several components,
     the one with most cameras is read.
     """
-    chunk = _chunk(path, read_legacy_text(path))
+    chunk = _chunk(path, read_text(path))
     every = chunk.findall("cameras//camera")
     components = Counter(photo.get("component_id", "") for photo in every if photo.find("transform") is not None)
     if not components:

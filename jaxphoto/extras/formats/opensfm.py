@@ -35,7 +35,7 @@ from jaxphoto.extras.formats.project import (
 )
 from jaxphoto.georeferencing.map_frame import Place
 from jaxphoto.io.camera_files import CameraSource
-from jaxphoto.io.text_files import has_words, read_legacy_text
+from jaxphoto.io.text_files import has_words, read_text
 from jaxphoto.io.toml import Section
 
 RECONSTRUCTION, TRACKS, REFERENCE = "reconstruction.json", "tracks.csv", "reference_lla.json"
@@ -60,7 +60,7 @@ def read(path: Path) -> Project:
     folder = path.parent
     if not (folder / TRACKS).is_file():
         raise InputError(f"{path}: {TRACKS} not found in its folder. Copy it from the project's folder (opensfm)")
-    content = _largest(path, json.loads(read_legacy_text(path)))
+    content = _largest(path, json.loads(read_text(path)))
     shots, points = content.section("shots").values, content.section("points").values
     cameras = {name: _camera(path, content.section("cameras").section(name)) for name in content.section("cameras")}
     sections = [Section(path.name, f"shots.{name}", shot) for name, shot in shots.items()]
@@ -91,7 +91,7 @@ def _reference(folder: Path, content: Section) -> Place | None:
     """Return the origin of the world on WGS 84; None if unknown (0, 0 in reconstructions without GPS)."""
     path, reference = folder / REFERENCE, content.section("reference_lla")
     if "reference_lla" not in content:
-        reference = Section(path.name, "", json.loads(read_legacy_text(path)) if path.is_file() else {})
+        reference = Section(path.name, "", json.loads(read_text(path)) if path.is_file() else {})
     place = tuple(reference.number(key, 0.0) for key in ("longitude", "latitude", "altitude"))
     return place if any(place[:2]) else None  # type: ignore[return-value]
 
@@ -128,7 +128,7 @@ def _tracks(
     path: Path, files: list[str], ids: list[str], cameras: list[ProjectCamera]
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Return image index, point index and pixel coordinates of the image points of known shots and points."""
-    lines = read_legacy_text(path).split("\n")
+    lines = read_text(path).split("\n")
     begin = 1 if lines[0].startswith("OPENSFM_TRACKS_VERSION_") else 0
     shot_of, point_of = {name: k for k, name in enumerate(files)}, {name: k for k, name in enumerate(ids)}
     index, xy, rows = [], [], []

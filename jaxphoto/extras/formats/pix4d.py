@@ -22,7 +22,7 @@ from jaxphoto.extras.formats.files import Format, row_numbers
 from jaxphoto.extras.formats.project import BROWN_TERMS, OPENCV, Project, ProjectCamera, in_pixels, pose
 from jaxphoto.extras.formats.texts import points_of
 from jaxphoto.io.camera_files import CameraSource
-from jaxphoto.io.text_files import has_words, read_legacy_text
+from jaxphoto.io.text_files import has_words, read_text
 
 CAMERAS_FILE, POINTS_FILE, OFFSET_FILE = "calibrated_camera_parameters.txt", "tp_pix4d.txt", "offset.xyz"
 _HEAD = "fileName imageWidth imageHeight"
@@ -39,7 +39,7 @@ def find(source: Path) -> list[Path]:
 
 def read(path: Path) -> Project:
     """Read a project. Photographs with equal K and distortion share a camera with all parameters free."""
-    name, lines = path.name.removesuffix(CAMERAS_FILE), read_legacy_text(path).split("\n")
+    name, lines = path.name.removesuffix(CAMERAS_FILE), read_text(path).split("\n")
     # The header ends at the first empty line.
     begin = lines.index("") + 1 if "" in lines else len(lines)
     rows = [(k + 1, line) for k, line in enumerate(lines) if k >= begin and line.strip()]
@@ -64,7 +64,7 @@ def read(path: Path) -> Project:
     shown = points_of(path.with_name(name + POINTS_FILE), files, path.name)
     offset, offset_path = [0.0] * 3, path.with_name(name + OFFSET_FILE)
     if offset_path.is_file():
-        offset = row_numbers(offset_path, 1, read_legacy_text(offset_path).split(), 3)
+        offset = row_numbers(offset_path, 1, read_text(offset_path).split(), 3)
     return Project(
         name.strip("_"), {str(k): _camera(path, kind.tolist()) for k, kind in enumerate(kinds)}, (), files,
         [str(k) for k in number.tolist()], pose(numbers[:, 19:].reshape(-1, 3, 3), numbers[:, 16:19] + offset),

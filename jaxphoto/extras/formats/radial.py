@@ -34,7 +34,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.extras.formats.files import Format, by_content, content_rows, row_numbers, warn
 from jaxphoto.extras.formats.project import CameraModel, Project, ProjectCamera, pixels_of, translations
 from jaxphoto.io.camera_files import ASSUMED_PIXEL_MM
-from jaxphoto.io.text_files import has_words, read_legacy_text
+from jaxphoto.io.text_files import has_words, read_text
 from jaxphoto.io.text_tables import LARGEST
 
 LIST = "list.txt"
@@ -75,7 +75,7 @@ def _project(
 
 def read_bundler(path: Path) -> Project:
     """Read a bundle file; images without orientation are skipped."""
-    lines = read_legacy_text(path).split("\n")
+    lines = read_text(path).split("\n")
     numbers = np.array(" ".join(line for line in lines if not line.startswith("#")).split(), float)
     if not (np.abs(numbers) <= LARGEST).all():
         raise InputError(f"{path.name}: a number is not finite or too large. Export it again")
@@ -113,7 +113,7 @@ def _listed_names(path: Path, number: int) -> list[str]:
     stem = path.stem.replace("bundle", "list", 1)
     for file in (path.with_name(name) for name in (f"{stem}.txt", f"{stem}.out", LIST)):
         if file != path and file.is_file():
-            names = [line.split()[0] for line in read_legacy_text(file).split("\n") if line.strip()]
+            names = [line.split()[0] for line in read_text(file).split("\n") if line.strip()]
             if len(names) != number:
                 raise InputError(
                     f"{file.name} has {len(names)} photographs, but {path.name} has {number} cameras; complete it"

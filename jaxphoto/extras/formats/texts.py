@@ -46,7 +46,7 @@ from jaxphoto.extras.formats.project import Project, ProjectCamera, with_system
 from jaxphoto.io.block_folder.camera_section import Camera, camera_section
 from jaxphoto.io.camera_files import CAMERA, SeveralCamerasError, read_camera_file
 from jaxphoto.io.control_table import PLACE, columns_of
-from jaxphoto.io.text_files import read_legacy_text
+from jaxphoto.io.text_files import decoded, read_bytes, read_text
 from jaxphoto.io.text_tables import is_number, read_csv
 from jaxphoto.io.toml import toml_text
 from jaxphoto.unknowns import FIXED
@@ -137,7 +137,7 @@ def _layout(path: Path) -> tuple[str, int, dict[str, int]]:
     """Return angles, matrices, bingo or "" (no orientations), the index of the first nonempty line of values, and the
     columns of angles, counted from the end of a row: names may contain blanks.
     """
-    lines = numbered_lines(read_legacy_text(path))
+    lines = numbered_lines(decoded(read_bytes(path)))
     if any(line.split(maxsplit=1)[0] == _ORIA for _, line in lines):
         return "bingo", 0, {}
     cells = [_cells(line) for _, line in lines[:_BEGIN]]
@@ -164,7 +164,7 @@ def _cells(line: str) -> list[str]:
 
 def read_exterior(path: Path) -> ExteriorText:
     """Read the orientations in a text file. Raise InputError with the row number if a row is invalid."""
-    (kind, first, columns), lines = _layout(path), numbered_lines(read_legacy_text(path))
+    (kind, first, columns), lines = _layout(path), numbered_lines(read_text(path))
     if not kind:
         raise InputError(f"{path.name} has no orientations; write the header {_HEADER!r} above the rows")
     above = "\n".join(line for _, line in lines[: first or _BEGIN])
@@ -294,7 +294,7 @@ def points_of(text: Path, files: Sequence[str], of: str, cameras: Sequence[Proje
     `files`.
     """
     heads, photograph, points, rows, within = list[str](), list[int](), list[str](), list[list[float]](), False
-    for k, line in enumerate(read_legacy_text(text).split("\n"), 1):
+    for k, line in enumerate(read_text(text).split("\n"), 1):
         words = line.split()
         if not words or words == [_END]:
             within = False
