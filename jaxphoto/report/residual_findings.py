@@ -65,7 +65,9 @@ def residual_findings(tables: Tables) -> Iterator[Finding]:
     blunders = list(_blunders(tables, culprits, sizes))
     names = [e.subject for e in first]
     if sizes:
-        effects = list(_systematic(tables, fits, sizes))
+        before, effects = effects, list(_systematic(tables, fits, sizes))
+        explained = {e.subject for e in before} - {e.subject for e in effects}
+        blunders += [Finding("explained_effects", "note", subject) for subject in sorted(explained)]
     worst = min((SEVERITIES.index(f.severity) for f in _blunders(tables, tables.culprits)), default=len(SEVERITIES) - 1)
     for effect in (e for e in effects if e.subject in names):
         severity = SEVERITIES[min(SEVERITIES.index(effect.severity), worst)]
@@ -491,7 +493,9 @@ def component_findings(
         found.append(Finding("components_not_converged", "warning", value=components.iterations))
     elif stated is not None and components.supported.any():
         found.append(_estimated_weights(components, stated))
-        found += input_findings(Tables(stated), found)
+        before = Tables(stated)
+        found += input_findings(before, found)
+        found += _other_explanations(before, Tables(components.adjusted))
     return found + [Finding("component", "warning", sentence) for sentence in components.warnings.values()]
 
 
@@ -519,3 +523,16 @@ def _estimated_weights(components: statistics.VarianceComponents, stated: Adjust
     numbers = {"effect": effects[0].replace("; ", "; sigma of ") if effects else ""}
     severity: Severity = "note" if usual else "warning"
     return Finding("weights", severity, subject, factors[worst], 1.0, numbers=numbers)
+
+
+def _other_explanations(stated: Tables, estimated: Tables) -> Iterator[Finding]:
+    """Report effects and outliers that are significant with the stated, but not with the estimated weights."""
+    subjects, outliers = (
+        [{e.subject for e in _systematic(t, True)} for t in (stated, estimated)],
+        [{(s.group, s.row) for s in t.blunders.suspects} for t in (stated, estimated)],
+    )
+    causes = sorted(subjects[0] - subjects[1])
+    if n := len(outliers[0] - outliers[1]):
+        causes.append(counted(n, "outlier"))
+    if causes:
+        yield Finding("other_explanations", "note", few(causes), len(causes))

@@ -2,7 +2,9 @@
 
 With correct weights v'Pv follows chi-square with nu degrees of freedom (the redundancy), and v'Pv of a group has the
 mean nu_g, the sum of its redundancy numbers (Förstner 1979). Its variance is at most the variance of chi-square with
-nu_g degrees of freedom, so the group test is conservative.
+nu_g degrees of freedom, so the group test is conservative. If nu_g is below 1 (a group with far too large weights),
+v'Pv / nu_g exceeds a value above 1.54 at most with the probability of chi-square with one degree of freedom (Székely
+and Bakirov, Extremal probabilities for Gaussian quadratic forms, 2003).
 """
 
 import equinox as eqx
@@ -17,8 +19,11 @@ from jaxphoto.compiling import call_compiled
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.quantiles import chi_square_tails
-from jaxphoto.statistics.reliability import Redundancy
+from jaxphoto.statistics.reliability import UNCHECKED, Redundancy
 from jaxphoto.statistics.variance_components import Parts
+
+# Value above which the bound for a redundancy below one holds.
+_EXTREMAL = 1.54
 
 
 @pretty_repr
@@ -54,14 +59,14 @@ def global_test(adjusted: Adjustment, redundancy: Redundancy | None = None) -> V
 
 
 def group_factors(adjusted: Adjustment, redundancy: Redundancy) -> list[VarianceFactor]:
-    """Test the variance factor of every group with a redundancy of at least one."""
+    """Test the variance factor of every group with redundancy."""
     names = tuple(observation_groups(adjusted))
     whole = {name: np.full(np.shape(adjusted.residuals[name]), k) for k, name in enumerate(names)}
     return part_factors(adjusted, Parts(names, whole), redundancy)
 
 
 def part_factors(adjusted: Adjustment, parts: Parts, redundancy: Redundancy) -> list[VarianceFactor]:
-    """Test the variance factor of every part with a redundancy of at least one."""
+    """Test the variance factor of every part with redundancy."""
     sums = np.zeros((4, len(parts.labels) + 1))
     for name, part in parts.part_of.items():
         v, r = np.asarray(adjusted.residuals[name]), np.asarray(redundancy[name])
@@ -71,7 +76,7 @@ def part_factors(adjusted: Adjustment, parts: Parts, redundancy: Redundancy) -> 
     return [
         _tested(label, int(n), square, r, expected / r)
         for label, n, square, r, expected in zip(parts.labels, *sums[:, :-1].tolist(), strict=True)
-        if r >= 1
+        if r > UNCHECKED
     ]
 
 
@@ -114,5 +119,9 @@ def _slopes(interior: InteriorOrientation, xy: Float[Array, "rows 2"]) -> Float[
 def _tested(group: str, n: int, sum_of_squares: float, redundancy: float, expected: float) -> VarianceFactor:
     if redundancy <= 0:
         return VarianceFactor(group, n, redundancy, 1.0, 1.0)
-    p = 2 * min(chi_square_tails(sum_of_squares / expected, redundancy))
+    ratio = sum_of_squares / expected
+    if redundancy < 1:
+        p = chi_square_tails(ratio / redundancy, 1)[1] if ratio > _EXTREMAL * redundancy else 1.0
+    else:
+        p = 2 * min(chi_square_tails(ratio, redundancy))
     return VarianceFactor(group, n, redundancy, sum_of_squares / redundancy, min(p, 1.0), expected)
