@@ -8,7 +8,7 @@ import equinox as eqx
 import jax
 import numpy as np
 import pandas as pd
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxphoto import statistics
 from jaxphoto.adjustment import Adjustment
@@ -28,6 +28,11 @@ from jaxphoto.unknowns import Unknowns, Weighted
 
 # Median cosine of the tilt above which images are near-vertical (45 degrees).
 NEAR_VERTICAL = 0.7
+
+
+# Maximum deviation of phi from +-90 degrees at which omega and kappa are not separable: their sigma is that of the
+# rotation about the axis, multiplied by 1 / cos(phi) > 5.7. Sigma above which an angle is undetermined.
+_INSEPARABLE_DEG, _DETERMINED_DEG = 10.0, 180.0
 
 
 class Tables:
@@ -203,7 +208,11 @@ class Tables:
 
     @cached_property
     def exterior(self) -> pd.DataFrame:
-        """Exterior orientation: image, X_m ... kappa_deg and their standard deviations."""
+        """Exterior orientation: image, X_m ... kappa_deg and their standard deviations.
+
+        If phi of an image is near +-90 degrees (`inseparable_angles`), standard deviations of the rotations about the
+        axes of the camera follow: sigma_rx_deg, sigma_ry_deg, sigma_rz_deg. Undetermined angles have no sigma.
+        """
         exterior = self.adjusted.unknowns.exterior
         angles = angles_deg(np.asarray(exterior.camera_from_object))
         sigma = self._if_converged(self.covariance.exterior_sigma) * [1, 1, 1, *[180 / np.pi] * 3]
@@ -211,7 +220,18 @@ class Tables:
         values = np.hstack([np.asarray(exterior.position), angles, sigma])
         table = pd.DataFrame(values, columns=[*names, *(f"sigma_{n}" for n in names)])
         table.insert(0, "image", self.adjusted.block.images)
+        if self.inseparable_angles.any():
+            angle_sigmas = [f"sigma_{name}" for name in names[3:]]
+            table[angle_sigmas] = table[angle_sigmas].where(table[angle_sigmas] < _DETERMINED_DEG)
+            about_axes = statistics.covariance(self.adjusted, "camera").exterior_sigma
+            table[[f"sigma_r{axis}_deg" for axis in "xyz"]] = np.degrees(self._if_converged(about_axes)[:, 3:])
         return table
+
+    @property
+    def inseparable_angles(self) -> Bool[np.ndarray, "images"]:
+        """True for images whose omega and kappa are not separable: phi within 10 degrees of +-90."""
+        sine = np.asarray(self.adjusted.unknowns.exterior.camera_from_object)[:, 2, 0]
+        return np.abs(sine) > np.cos(np.radians(_INSEPARABLE_DEG))
 
     @cached_property
     def exterior_map(self) -> pd.DataFrame:

@@ -91,6 +91,7 @@ def _findings(tables: Tables) -> Iterator[Finding]:
     residual = list(residual_findings(tables))
     yield from input_findings(tables, residual)
     yield from residual
+    inseparable = {adjusted.block.images[k] for k in np.flatnonzero(tables.inseparable_angles)}
     of_cameras = {camera: weaknesses(tables, camera, c) for camera, c in tables.correlations.items()}
     yield from _weak(tables, frozenset().union(*(w.labels for weak in of_cameras.values() for w in weak)))
     for camera, c in tables.correlations.items():
@@ -98,8 +99,9 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         yield from (w.finding for w in weak)
         explained = frozenset().union(*(w.explains for w in weak))
         felt = {name for name, moved in at_corner(tables, camera).items() if moved > FELT}
-        yield from _correlated(camera, c, explained, felt)
+        yield from _correlated(camera, c, explained, felt, inseparable)
     yield from scanner_findings(tables)
+    yield from angle_findings(tables)
     yield from ground_findings(tables)
     yield from shutter_findings(tables)
     yield from drift_findings(tables)
@@ -303,9 +305,12 @@ def _not_significant(tables: Tables, s: Significance) -> Finding:
 
 
 def _correlated(
-    camera: str, c: Correlations, explained: frozenset[tuple[str, str]], felt: set[str]
+    camera: str, c: Correlations, explained: frozenset[tuple[str, str]], felt: set[str], inseparable: set[str]
 ) -> Iterator[Finding]:
-    """Report high correlations, except the pairs in `explained`: a warning if the parameter affects the images."""
+    """Report high correlations, except the pairs in `explained`: a warning if the parameter affects the images.
+
+    Correlations within the images in `inseparable`, whose omega and kappa are not separable, are not reported.
+    """
     subject, limit = camera_words(camera), HIGH_CORRELATION
     if pairs := high_pairs(c.parameters, c.interior, limit):
         words = _correlated_words([(symbol(a), symbol(b), rho) for a, b, rho in pairs])
@@ -328,7 +333,8 @@ def _correlated(
         severity: Severity = "warning" if weak else "note"
         numbers = {"pairs": names}
         yield Finding("correlation_exterior", severity, subject, float(worst.max()), limit, hint, numbers)
-    within = np.abs(c.within_image).max(axis=0)
+    regular = np.array([image not in inseparable for image in c.images])
+    within = np.abs(c.within_image[regular]).max(axis=0, initial=0.0)
     strong = sorted((within[i, j], i, j) for i in range(6) for j in range(i) if within[i, j] > HIGH_OWN_CORRELATION)
     if strong:
         names = few([f"{c.eop_names[j]} and {c.eop_names[i]} (up to {r:.3f})" for r, i, j in strong[::-1]])
@@ -354,6 +360,12 @@ def scanner_findings(tables: Tables) -> Iterator[Finding]:
         name = lambda path: path_words(path).partition(" [")[0]  # noqa: E731
         numbers = {"pairs": _correlated_words([(name(a), name(b), rho) for a, b, rho in found])}
         yield Finding("correlation_scanner", "warning", "scanner", found[0][2], HIGH_CORRELATION, numbers=numbers)
+
+
+def angle_findings(tables: Tables) -> Iterator[Finding]:
+    """Report images whose omega and kappa are not separable."""
+    if names := [tables.adjusted.block.images[k] for k in np.flatnonzero(tables.inseparable_angles)]:
+        yield Finding("inseparable_angles", "note", few(names), len(names))
 
 
 def ground_findings(tables: Tables) -> Iterator[Finding]:
