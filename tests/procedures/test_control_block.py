@@ -1,6 +1,7 @@
 """A block in a frame of its own, surveyed points in UTM and marks: the truth again, blunders named, nothing turned."""
 
 import dataclasses
+import re
 
 import numpy as np
 import pytest
@@ -10,6 +11,7 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.observations import CameraPositions
 from jaxphoto.procedures.control import GivenControl, Marks, at_optimum, control_block
+from jaxphoto.procedures.control.control_block import check_handedness, onto_control
 from jaxphoto.procedures.control.marks import without_names
 from jaxphoto.simulation import image_coordinates
 from tests.blocks import free_network, simulated
@@ -180,3 +182,25 @@ def test_control_that_cannot_be_is_refused_in_a_sentence(marked, change, words):
     with pytest.raises(InputError) as caught:
         found_in(marked, change(marked.control))
     assert words in str(caught.value), caught.value
+
+
+@pytest.mark.parametrize("factor", [2400 / 4608, 0.5, 0.25])
+def test_marks_of_resized_pictures_are_told_by_their_factor(marked, factor):
+    marks = marked.control.marks
+    resized = marks._replace(column_row=factor * marks.column_row)
+    with pytest.raises(InputError) as error:
+        found_in(marked, marked.control._replace(marks=resized))
+    told = float(re.search(r"multiplied by ([\d.]+)", str(error.value))[1])
+    assert told == pytest.approx(1 / factor, rel=0.01)
+
+
+def test_flat_control_with_exchanged_axes_is_refused():
+    """On flat ground a mirrored plan is that of a block under the ground, which looks up."""
+    block, sigma = simulated("cross").block, np.full(8, 0.1)
+    there = np.append(np.random.default_rng(3).uniform(-300, 300, (8, 2)), np.zeros((8, 1)), axis=1)
+    exchanged = there[:, [1, 0, 2]]
+    mirrored = onto_control(there, exchanged, sigma, "points.csv")
+    assert mirrored.agree.all()
+    with pytest.raises(InputError, match="X and Y exchanged"):
+        check_handedness(block, mirrored, there, exchanged, sigma, "points.csv")
+    check_handedness(block, onto_control(there, there, sigma, "points.csv"), there, there, sigma, "points.csv")

@@ -28,7 +28,15 @@ from jaxphoto.block import Block, Frame, Start
 from jaxphoto.errors import DatumError, InputError, counted, few
 from jaxphoto.georeferencing.map_frame import MapFrame, check_heights
 from jaxphoto.procedures.adjust import adjust_for_tables
-from jaxphoto.procedures.control.marks import Marked, intersected, into_block, marked, with_gnss_bias, without_names
+from jaxphoto.procedures.control.marks import (
+    Marked,
+    factor_of_marks,
+    intersected,
+    into_block,
+    marked,
+    with_gnss_bias,
+    without_names,
+)
 from jaxphoto.procedures.control.surveyed import (
     MARK_SIGMA_PX,
     SIGMA_M,
@@ -348,6 +356,14 @@ def control_block(
         first = f" ({few(list(dict.fromkeys(control.marks.image)))})" if control.marks.image else ""
         raise InputError(f"{points.file}: no mark{first} is in a photograph of the block ({few(block.images)})")
     met = intersected(block, block.start.unknowns, rows, ids)
+    if (factor := factor_of_marks(block, block.start.unknowns, rows, met.good)) is not None:
+        sensor = block.sensors[block.image_camera[rows.image[0]]]
+        raise InputError(
+            f"{points.file}: the marks contradict one another, but agree if their pixel coordinates are multiplied by "
+            f"{factor:.3g}: they were measured in pictures of about {sensor.width_px / factor:.0f} x "
+            f"{sensor.height_px / factor:.0f} px, the camera has {sensor.width_px} x {sensor.height_px} px. Multiply "
+            "them, or mark the photographs in full size"
+        )
     rows, messages = rows.take(met.good), [*messages, *met.sentences]
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
     try:
@@ -438,7 +454,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     onto = onto_control(met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file)
     agree[known] = onto.agree
     if not frame.at_place:
-        _check_handedness(block, onto, met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file)
+        check_handedness(block, onto, met[known], frame.xyz[known], np.hypot(surveyed, spread), points.file)
     messages = [f"{int(onto.agree.sum())} of {counted(len(known), 'control point')} define the frame of the block"]
     if frame.at_place:
         off = np.median((frame.xyz - met)[known[onto.agree]], axis=0)
@@ -449,7 +465,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
     return block, onto.similarity.of(met), agree, messages
 
 
-def _check_handedness(block: Block, onto: OntoControl, there, here, sigma_m, file: str) -> None:
+def check_handedness(block: Block, onto: OntoControl, there, here, sigma_m, file: str) -> None:
     """Raise InputError if all images look up and the control fits as well with X and Y exchanged.
 
     A mirrored plan on flat ground is that of a block turned by half a turn about a horizontal axis.

@@ -168,6 +168,45 @@ def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, 
     return Intersected(intersection.points, intersection.covariance, good, tuple(messages))
 
 
+# Factors of the pixel coordinates of marks that are tried; minimum fraction of marks that agree with the right one, and
+# maximum fraction that agree without it.
+_FACTORS, _AGREE, _DISAGREE = np.geomspace(0.1, 10.0, 461), 0.9, 0.5
+
+
+def factor_of_marks(block: Block, unknowns: Unknowns, rows: Marked, good: Bool[np.ndarray, "rows"]) -> float | None:
+    """Return the factor of the pixel coordinates with which the marks agree, if most contradict one another.
+
+    Marks of resized pictures need one factor, the ratio of the sizes. `good`: marks that agree as given.
+    """
+    several = np.bincount(rows.point)[rows.point] > 1
+    if several.sum() < 4 or good[several].mean() > _DISAGREE:
+        return None
+    rows = rows.take(several)
+    origins = np.asarray(unknowns.exterior.position, float)[rows.image]
+    matrices = np.asarray(unknowns.exterior.camera_from_object, float)
+    sensors = [block.sensors[block.image_camera[k]] for k in rows.image]
+    half = np.array([(s.width_px, s.height_px) for s in sensors]) / 2
+    pixel = np.array([(s.pixel_mm, -s.pixel_mm) for s in sensors])
+    column_row = rows.xy_mm / pixel + half
+    point, n = rows.point, int(rows.point.max()) + 1
+
+    def scaled(factor: float) -> Marked:
+        return rows._replace(xy_mm=(factor * column_row - half) * pixel)
+
+    def misclosure(factor: float) -> float:
+        directions = turn_to_object(matrices, rows.image, rays_of(block, unknowns, scaled(factor)))
+        places, _ = intersect_points(origins, directions, point, n, min_angle=_PARALLEL)
+        towards = places[point] - origins
+        across = np.linalg.norm(np.cross(directions, towards), axis=1) / np.linalg.norm(towards, axis=1)
+        return float(np.nanmedian(across))
+
+    factor = float(min(_FACTORS, key=misclosure))
+    step = _FACTORS[1] / _FACTORS[0]
+    factor = float(min(np.geomspace(factor / step, factor * step, 41), key=misclosure))
+    ids = tuple(map(str, range(n)))
+    return factor if intersected(block, unknowns, scaled(factor), ids).good.mean() >= _AGREE else None
+
+
 def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:
     """Mark the rays of one point that pass the position of most of them; all False if no two rays intersect."""
     n = len(origins)
