@@ -27,6 +27,7 @@ from jaxphoto.statistics import (
     VarianceFactor,
     covariance,
     normalised_residuals,
+    observation_groups,
     part_factors,
     partition_observations,
     redundancy_numbers,
@@ -53,7 +54,8 @@ def estimate_weights(
     `report` receives progress. Raises InputError for an adjustment that has not converged.
     """
     parts = partition_observations(adjusted, _SPLITS)
-    if len(parts.labels) < 2:
+    if len(parts.labels) < 2 and len(observation_groups(adjusted)) < 2:
+        # Sigma naught is the only factor, unless prior information has weights of its own.
         return None
     estimated: VarianceComponents | None = None
     chosen, kept = set[str](), set[str]()

@@ -11,7 +11,7 @@ from jaxphoto import adjust, covariance, estimate_weights, variance_components
 from jaxphoto.procedures.snooping import inflated_components
 from jaxphoto.report import component_findings
 from jaxphoto.simulation import remeasure
-from tests.blocks import adjusted_example, example
+from tests.blocks import adjusted_example, example, free_network
 
 
 @pytest.fixture(scope="module")
@@ -77,6 +77,14 @@ def test_a_wrong_sigma_of_image_points_is_estimated_and_no_other(block, factor):
     np.testing.assert_allclose(*sigmas, rtol=0.1)
 
 
+def test_prior_information_needs_the_weight_of_the_image_points():
+    block = with_sigmas_times(free_network().weigh("c", sigma=0.01), {"image_points": 3.0})
+    estimated = estimate_weights(adjust(block))
+    assert estimated.labels == ("image_points",) and estimated.factor[0] == pytest.approx(1 / 9, rel=0.2)
+    # Image points alone: sigma naught has the factor.
+    assert estimate_weights(adjust(with_sigmas_times(free_network(), {"image_points": 3.0}))) is None
+
+
 @pytest.fixture(scope="module")
 def precise(block):
     """The block measured with a twentieth of the image noise: its stations check one another."""
@@ -108,7 +116,7 @@ def test_a_shifted_strip_or_a_wrong_height_is_not_a_weight(block):
 @pytest.mark.slow
 @pytest.mark.parametrize("recipe", ["image_1px", "rtk"])
 def test_intervals_of_the_camera_cover_the_truth(recipe):
-    """Flights whose image sigma is stated three times too large; of 30, at least 24 cover in 99.94 % of such studies."""
+    """Image sigma stated three times too large: of 30 intervals, at least 24 cover in 99.94 % of such studies."""
     found = list(flights(recipe, range(30)))
     assert len(found) >= 29
     stated, estimated = (coverage([getattr(f, which) for f in found]) for which in ("stated", "estimated"))
