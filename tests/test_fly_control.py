@@ -80,7 +80,7 @@ def test_a_flight_is_brought_onto_its_control(flown, tmp_path, monkeypatch, caps
         (lambda t: t, (), "does not state the coordinate system of its points"),
         (lambda t: t.rename(columns={"X_m": "Y_m", "Y_m": "X_m"}), ("--control-epsg", CODE), "coordinates exchanged"),
         (lambda t: t, ("--control-epsg", CODE + 1), "if their system is EPSG:32634"),
-        (lambda t: t.drop(columns="X_m"), ("--control-epsg", CODE), "not a control file"),
+        (lambda t: t.drop(columns="X_m"), ("--control-epsg", CODE), "row 1"),
     ],
 )
 def test_control_that_cannot_be_ends_before_anything_is_matched(

@@ -1,6 +1,6 @@
 """Variance components of the parts whose stated standard deviations contradict the residuals.
 
-Standard deviations of matched image points are rarely known beforehand. If only their own weight is wrong, sigma naught
+Standard deviations of matched image points are rarely known. If only their own weight is wrong, sigma naught
 corrects all standard deviations. With other observations (stations, control, lidar) the ratio of weights is wrong as
 well, and sigma naught, dominated by the image points, scales the standard deviations of the others too.
 

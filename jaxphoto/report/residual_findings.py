@@ -502,7 +502,7 @@ def component_findings(
 def _estimated_weights(components: statistics.VarianceComponents, stated: Adjustment) -> Finding:
     """Report the factors of the standard deviations, and the sigma of c with and without them.
 
-    The standard deviations of matched image points are not known beforehand; other factors than theirs are a warning.
+    Only those of matched image points are usually unknown: factors of other groups are a warning.
     """
     factors = {
         label: float(np.sqrt(f))

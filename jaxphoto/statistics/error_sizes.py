@@ -17,6 +17,7 @@ from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, solve
 from jaxphoto.errors import JaxphotoError
+from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.blunder_test import Suspect, effect_columns
 from jaxphoto.statistics.hat_matrix import HatMatrix
 from jaxphoto.statistics.systematic_effects import MIN_FRACTION, EffectTerm, SystematicEffect, truncated_inverse
@@ -26,6 +27,7 @@ _MAX_ITERATIONS = 10
 _TOLERANCE = 0.05
 
 
+@pretty_repr
 class ErrorSizes(NamedTuple):
     """Sizes of errors estimated together, with a posteriori standard deviations, and the corrected adjustment."""
 

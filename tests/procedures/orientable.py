@@ -20,8 +20,8 @@ class Camera(NamedTuple):
     """The true camera: c, principal point (mm), K1, K2, in the sense of `jaxphoto.Brown`."""
 
     c: float = 8.0
-    x_p: float = 0.04
-    y_p: float = -0.03
+    xp: float = 0.04
+    yp: float = -0.03
     k1: float = 1.5e-3
     k2: float = -2e-5
 
