@@ -68,7 +68,7 @@ def adjust(
     from jaxphoto.procedures.adjust import adjust_for_tables
     from jaxphoto.procedures.snooping import inflated_components
     from jaxphoto.procedures.weights import estimate_weights
-    from jaxphoto.statistics import SPLITS
+    from jaxphoto.statistics import SPLITS, prepare_hat_matrix
     from jaxphoto.writing import check_folder, whole_folder
     from jaxphoto_command.certificate import Provenance
 
@@ -92,15 +92,23 @@ def adjust(
             loss = LOSSES[robust]() if robust else None
             snooped = jaxphoto.snoop(read, loss=loss, max_steps=max_steps, report=progress.update)
         adjusted = snooped.adjusted if snooped else adjust_for_tables(read, max_steps, progress.update)
+        progress.update("computing statistics")
+        if bool(adjusted.converged):
+            prepare_hat_matrix(adjusted)
+        truth = read_truth(block)
+        tables = jaxphoto.Tables(adjusted, rotations, truth)  # type: ignore[arg-type]
         if weights is None and bool(adjusted.converged):
-            components = estimate_weights(adjusted, max_steps=max_steps, report=progress.update)
+            components = estimate_weights(
+                adjusted, redundancy=tables.redundancy, max_steps=max_steps, report=progress.update
+            )
         elif weights != "stated" and bool(adjusted.converged):
             progress.update("estimating variance components")
             components = jaxphoto.variance_components(adjusted, splits, max_steps=max_steps)
             masked += inflated_components(adjusted, components, splits, max_steps=max_steps)
-        stated, adjusted = adjusted, components.adjusted if components else adjusted
-        progress.update("computing statistics")
-        tables = jaxphoto.Tables(adjusted, rotations, read_truth(block))  # type: ignore[arg-type]
+        stated = adjusted
+        if components:
+            adjusted = components.adjusted
+            tables = jaxphoto.Tables(adjusted, rotations, truth)  # type: ignore[arg-type]
         findings = report.snooped_findings(snooped, read) if snooped else []
         findings += report.component_findings(components, masked, stated) if components else []
         verdict = report.verdict_of(tables, findings)

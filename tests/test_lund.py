@@ -41,17 +41,18 @@ def test_the_street_is_oriented(folder):
     assert 600 < c_px < 1300
 
 
-def colmap_model(folder, tmp_path):
-    """COLMAP's poses: of three attempts, whose chances differ, the one that places most images best."""
+def colmap_model(folder, tmp_path, c_px):
+    """COLMAP's poses for this principal distance: of three attempts, the one that places most images best."""
     pycolmap = pytest.importorskip("pycolmap", reason="pycolmap, the independent check, is not installed")
     pycolmap.logging.minloglevel = 2
     database = tmp_path / "colmap.db"
     one = pycolmap.CameraMode.SINGLE
-    pycolmap.extract_features(database, folder, camera_mode=one, device=pycolmap.Device.cpu)
+    reader = pycolmap.ImageReaderOptions(camera_model="SIMPLE_RADIAL", camera_params=f"{c_px},512,384,0")
+    pycolmap.extract_features(database, folder, camera_mode=one, reader_options=reader, device=pycolmap.Device.cpu)
     pycolmap.match_exhaustive(database, device=pycolmap.Device.cpu)
     found = []
     for seed in range(3):
-        options = pycolmap.IncrementalPipelineOptions(random_seed=seed)
+        options = pycolmap.IncrementalPipelineOptions(random_seed=seed, ba_refine_focal_length=False)
         # As it comes, COLMAP finds no two images to begin with: all look along the line they stand on.
         options.mapper.init_max_forward_motion = 1.0
         options.mapper.init_min_tri_angle = 4.0
@@ -65,9 +66,12 @@ def colmap_model(folder, tmp_path):
 def test_poses_are_those_of_colmap(folder, tmp_path):
     """To a hundredth of the path's length, after a similarity: each of the images that both have oriented.
 
-    With 5,000 features a photograph; with more c is nearer to that of the lens, and farther from COLMAP's.
+    With our principal distance, which a walk straight ahead hardly determines: COLMAP's own is 752 px with residuals of
+    0.503 px, ours about 908 px, with which its residuals are 0.51 px. EXIF says 1,035 px.
     """
-    theirs, found = colmap_model(folder, tmp_path), oriented(folder, FEATURES)
+    found = oriented(folder, FEATURES)
+    camera = found.block.sensors["camera"]
+    theirs = colmap_model(folder, tmp_path, float(found.block.start.unknowns.interior["camera"].c) / camera.pixel_mm)
     ours = found.block.start.unknowns.exterior
     place = {name: k for k, name in enumerate(found.block.images)}
     both = sorted(set(place) & set(theirs))
@@ -88,5 +92,4 @@ def test_poses_are_those_of_colmap(folder, tmp_path):
         f"turned by {np.degrees(alike.magnitude()):.2f} degrees together, {angle.max():.2f} at most besides"
     )
     assert off.max() < 0.01 * path
-    # Their c is a tenth shorter: an image with its points 200 pixels to one side makes up for that by 1.4 degrees.
-    assert np.median(angle) < 0.7 and angle.max() < 3
+    assert np.median(angle) < 0.4 and angle.max() < 1.2

@@ -11,7 +11,8 @@ They retain their stated standard deviations, which are usually better known tha
 
 Larger residuals than stated may have other causes. A part keeps its stated standard deviations if a few blunders
 explain the increase (the median of the squared residuals does not have it), or if a shift or drift of a group of
-observations remains significant with the estimated ones: the tests of the adjustment then report these.
+observations remains significant with the estimated ones. Image points that exceed theirs more than threefold end the
+estimation. The tests of the adjustment then report these.
 """
 
 from collections.abc import Callable
@@ -19,10 +20,12 @@ from collections.abc import Callable
 import numpy as np
 
 from jaxphoto.adjustment import MAX_STEPS, Adjustment
+from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.errors import few
 from jaxphoto.statistics import (
     LEVEL,
     Parts,
+    Redundancy,
     VarianceComponents,
     VarianceFactor,
     covariance,
@@ -42,16 +45,23 @@ _RATIO = 1.1
 # Ratio of the mean and the median square of normalised residuals, both as estimates of their variance, above which a
 # few blunders explain a large mean. Median of chi-square with one degree of freedom.
 _FEW, _MEDIAN = 4.0, 0.455
+# Ratio of sigmas of image points above which weights are no sufficient explanation (docs/trust.md).
+_FITS = 3.0
 
 
 @outside_transformations
 def estimate_weights(
-    adjusted: Adjustment, *, max_steps: int = MAX_STEPS, report: Callable[[str], object] = lambda text: None
+    adjusted: Adjustment,
+    *,
+    redundancy: Redundancy | None = None,
+    max_steps: int = MAX_STEPS,
+    report: Callable[[str], object] = lambda text: None,
 ) -> VarianceComponents | None:
     """Estimate variance components of the parts whose residuals contradict their stated standard deviations.
 
     Returns the components of these parts, with the adjustment that uses them, or None if no part contradicts.
-    `report` receives progress. Raises InputError for an adjustment that has not converged.
+    `redundancy`: redundancy numbers of `adjusted`, if known. `report` receives progress. Raises InputError for an
+    adjustment that has not converged.
     """
     parts = partition_observations(adjusted, _SPLITS)
     if len(parts.labels) < 2 and len(observation_groups(adjusted)) < 2:
@@ -61,11 +71,15 @@ def estimate_weights(
     chosen, kept = set[str](), set[str]()
     while True:
         current = estimated.adjusted if estimated else adjusted
-        contradicting = [f for f in _contradictions(current, parts) if f.group not in kept]
+        factors = _contradictions(current, parts, None if estimated else redundancy)
+        contradicting = [f for f in factors if f.group not in kept | chosen]
         if not contradicting:
             return estimated
         worst, too_small = contradicting[0].group.split()[0], contradicting[0].sigma > 1
         new = {f.group for f in contradicting if f.group.split()[0] == worst and (f.sigma > 1) == too_small}
+        if worst == IMAGE_POINTS and max(f.sigma for f in contradicting if f.group in new) > _FITS:
+            # Image points that fit nothing distort all other residuals.
+            return estimated
         report(f"estimating the standard deviations of {few([label.replace('_', ' ') for label in sorted(new)])}")
         labels = [label for label in parts.labels if label in chosen | new]
         trial = variance_components(adjusted, parts.only(labels), max_steps=max_steps)
@@ -75,9 +89,9 @@ def estimate_weights(
             estimated, chosen, kept = trial, set(labels), set(trial.warnings)
 
 
-def _contradictions(adjusted: Adjustment, parts: Parts) -> list[VarianceFactor]:
+def _contradictions(adjusted: Adjustment, parts: Parts, redundancy: Redundancy | None) -> list[VarianceFactor]:
     """Return the parts whose variance factor differs from its expectation, most significant first."""
-    redundancy = redundancy_numbers(adjusted, covariance(adjusted, rows=True))
+    redundancy = redundancy or redundancy_numbers(adjusted, covariance(adjusted, rows=True))
     factors = part_factors(adjusted, parts, redundancy)
     level = LEVEL / max(len(factors), 1)
     different = [f for f in factors if f.p_value < level and not 1 / _RATIO < f.sigma < _RATIO]

@@ -141,11 +141,12 @@ def test_heights_that_nobody_surveyed_cost_a_sentence(marked):
 
 
 def test_marks_that_fit_nothing_are_why_there_is_no_control(marked):
-    """Such as lists that count in shrunk copies of the photographs."""
+    """Such as lists whose names are those of other photographs."""
     marks = marked.control.marks
-    shrunk = marked.control._replace(marks=marks._replace(column_row=0.4 * marks.column_row))
-    with pytest.raises(InputError, match=r"control points in two.*the marks of G0 in .* contradict one"):
-        found_in(marked, shrunk)
+    elsewhere = np.random.default_rng(5).uniform((0, 0), (4500, 3000), np.shape(marks.column_row))
+    wrong = marked.control._replace(marks=marks._replace(column_row=elsewhere))
+    with pytest.raises(InputError, match=r"control points in two.*the marks of G\d+ in .* contradict one"):
+        found_in(marked, wrong)
 
 
 def test_exchanged_names_are_seen(marked):

@@ -77,6 +77,14 @@ def test_a_wrong_sigma_of_image_points_is_estimated_and_no_other(block, factor):
     np.testing.assert_allclose(*sigmas, rtol=0.1)
 
 
+def test_image_points_that_fit_nothing_keep_their_weight(block):
+    rows = block.image_points
+    noise = 5 * np.asarray(rows.sigma) * np.random.default_rng(2).normal(size=np.shape(rows.xy))
+    wrong = block.with_observations({"image_points": dataclasses.replace(rows, xy=np.asarray(rows.xy) + noise)})
+    adjusted = adjust(wrong)
+    assert estimate_weights(adjusted) is None and adjusted.verdict().severity == "error"
+
+
 def test_prior_information_needs_the_weight_of_the_image_points():
     block = with_sigmas_times(free_network().weigh("c", sigma=0.01), {"image_points": 3.0})
     estimated = estimate_weights(adjust(block))
