@@ -2,7 +2,7 @@
 
 python benchmarks/error_sizes.py --flights 500
 
-Errors of 1 to 1000 standard deviations (log-uniform) are added to the example block, measured anew each time: to one
+Errors of 1 to 1000 standard deviations (log-uniform) are added to the example block, with new noise each time: to one
 observation, to all stations, or to the stations of one strip. Where a finding names the error with its size and sigma,
 the interval of 95 % is held against the truth.
 """

@@ -105,12 +105,12 @@ def adjust(
             progress.update("estimating variance components")
             components = jaxphoto.variance_components(adjusted, splits, max_steps=max_steps)
             masked += inflated_components(adjusted, components, splits, max_steps=max_steps)
-        stated = adjusted
+        stated = tables
         if components:
             adjusted = components.adjusted
             tables = jaxphoto.Tables(adjusted, rotations, truth)  # type: ignore[arg-type]
         findings = report.snooped_findings(snooped, read) if snooped else []
-        findings += report.component_findings(components, masked, stated) if components else []
+        findings += report.component_findings(components, masked, (stated, tables)) if components else []
         verdict = report.verdict_of(tables, findings)
         progress.update(f"writing {out}")
         times = adjusted.seconds | seconds
@@ -118,10 +118,10 @@ def adjust(
         with whole_folder(out) as work:
             source = "block" if snooped else os.path.relpath(block.resolve(), out.resolve())
             entries = {"block": source, **output.options()}
-            report.write_results(tables, verdict, work, times, entries, record, with_page=not no_report)
+            report.write_results(
+                tables, verdict, work, times, entries, record, with_page=not no_report, components=components
+            )
             provenance.write(read.images, work)
-            for name, table in (report.component_tables(components) if components else {}).items():
-                table.to_csv(work / f"{name}.csv", index=False)
             if snooped:
                 report.left_out_table(snooped, read).to_csv(work / "left_out.csv", index=False)
                 write_block(adjusted.block, work / "block")

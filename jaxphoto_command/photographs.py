@@ -202,7 +202,7 @@ def control(
     from jaxphoto.procedures.adjust import adjust
     from jaxphoto.procedures.control import at_optimum, control_block, retest
     from jaxphoto.procedures.weights import estimate_weights
-    from jaxphoto.report import Tables, component_findings, component_tables, verdict_of
+    from jaxphoto.report import Tables, component_findings, verdict_of
     from jaxphoto.report.page import versions
     from jaxphoto.report.photographs import control_findings, control_summary, write_control
     from jaxphoto.report.results import write_results, write_summary
@@ -220,12 +220,15 @@ def control(
         result = control_block(
             oriented, points, system=control_epsg, code=code, vertical=vertical, report=progress.update
         )
-        stated = result.adjusted
-        components = estimate_weights(stated, report=progress.update) if bool(stated.converged) else None
+        stated = Tables(result.adjusted)
+        components = None
+        if bool(result.adjusted.converged):
+            components = estimate_weights(result.adjusted, redundancy=stated.redundancy, report=progress.update)
         result = retest(result, components.adjusted) if components else result
         progress.update("computing statistics")
-        tables, adjusted = Tables(result.adjusted), result.adjusted
-        weights = component_findings(components, stated=stated) if components else []
+        adjusted = result.adjusted
+        tables = Tables(adjusted) if components else stated
+        weights = component_findings(components, weights=(stated, tables)) if components else []
         verdict = verdict_of(tables, [*weights, *control_findings(result)])
         progress.update(f"writing {out}")
         images = adjusted.block.images
@@ -233,9 +236,8 @@ def control(
         with whole_folder(out) as work:
             with whole_folder(work / "result") as folder:
                 method = {"block": "../block", **output.options()}
-                write_results(tables, verdict, folder, times, method, output.command_record(block, file, marks))
-                for name, table in (component_tables(components) if components else {}).items():
-                    table.to_csv(folder / f"{name}.csv", index=False)
+                record = output.command_record(block, file, marks)
+                write_results(tables, verdict, folder, times, method, record, components=components)
                 provenance.write(images, folder)
             write_control(result, work)
             write_summary({**verdict.summary, **control_summary(result), "versions": versions()}, work)

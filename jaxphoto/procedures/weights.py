@@ -71,7 +71,9 @@ def estimate_weights(
     chosen, kept = set[str](), set[str]()
     while True:
         current = estimated.adjusted if estimated else adjusted
-        factors = _contradictions(current, parts, None if estimated else redundancy)
+        if redundancy is None:
+            redundancy = redundancy_numbers(current, covariance(current, rows=True))
+        factors = _contradictions(current, parts, redundancy)
         contradicting = [f for f in factors if f.group not in kept | chosen]
         if not contradicting:
             return estimated
@@ -84,14 +86,13 @@ def estimate_weights(
         labels = [label for label in parts.labels if label in chosen | new]
         trial = variance_components(adjusted, parts.only(labels), max_steps=max_steps)
         kept |= new
-        if trial.converged and not (too_small and _has_another_cause(current, trial, parts, new)):
+        if trial.converged and not (too_small and _has_another_cause(current, redundancy, trial, parts, new)):
             # With the new weights, parts that were kept may have a different cause.
-            estimated, chosen, kept = trial, set(labels), set(trial.warnings)
+            estimated, chosen, kept, redundancy = trial, set(labels), set(trial.warnings), None
 
 
-def _contradictions(adjusted: Adjustment, parts: Parts, redundancy: Redundancy | None) -> list[VarianceFactor]:
+def _contradictions(adjusted: Adjustment, parts: Parts, redundancy: Redundancy) -> list[VarianceFactor]:
     """Return the parts whose variance factor differs from its expectation, most significant first."""
-    redundancy = redundancy or redundancy_numbers(adjusted, covariance(adjusted, rows=True))
     factors = part_factors(adjusted, parts, redundancy)
     level = LEVEL / max(len(factors), 1)
     different = [f for f in factors if f.p_value < level and not 1 / _RATIO < f.sigma < _RATIO]
@@ -99,7 +100,9 @@ def _contradictions(adjusted: Adjustment, parts: Parts, redundancy: Redundancy |
     return sorted(different, key=lambda f: -abs(np.log(f.sigma)) * f.redundancy**0.5)
 
 
-def _has_another_cause(adjusted: Adjustment, trial: VarianceComponents, parts: Parts, labels: set[str]) -> bool:
+def _has_another_cause(
+    adjusted: Adjustment, redundancy: Redundancy, trial: VarianceComponents, parts: Parts, labels: set[str]
+) -> bool:
     """Return True if blunders, or a shift or drift of a group, explain the large residuals of some parts.
 
     `trial`: adjustment with their components, `adjusted`: without.
@@ -109,7 +112,6 @@ def _has_another_cause(adjusted: Adjustment, trial: VarianceComponents, parts: P
     # Tests of effects over the image format do not depend on the weight of the image points.
     if any(e.p_value < level and not e.pattern.camera for e in effects):
         return True
-    redundancy = redundancy_numbers(adjusted, covariance(adjusted, rows=True))
     w = normalised_residuals(adjusted, redundancy)
     for label in labels:
         k = parts.labels.index(label)

@@ -421,14 +421,13 @@ def write_flight(
         times = {name: r.part.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(work / folder_name) as folder:
             entries = {"sigma_factor": r.sigma_factor, "flight": coverage_words(r.tables)}
-            write_results(r.tables, r.verdict, folder, times, {**source.entries, **entries})
+            entries = {**source.entries, **entries}
+            write_results(r.tables, r.verdict, folder, times, entries, components=r.part.components)
             correlated = with_correlated_sigma(r.tables.interior, r.part.adjusted, r.sigma_factor)
             correlated.to_csv(folder / "interior_correlated.csv", index=False)
             if r.part.controlled:
                 write_control(r.part.controlled, folder)
             beside(r.part, folder)
-            for name, table in (component_tables(r.part.components) if r.part.components else {}).items():
-                table.to_csv(folder / f"{name}.csv", index=False)
     images = pd.concat([r.images.assign(part=k) for k, r in enumerate(reports, 1)], ignore_index=True)
     images.to_csv(work / "images.csv", index=False)
     text = flight_page(reports, flight.left_out, spoilt, verdict, source, folders)

@@ -477,11 +477,12 @@ def component_tables(components: statistics.VarianceComponents) -> dict[str, pd.
 def component_findings(
     components: statistics.VarianceComponents,
     blunders: Sequence[InflatedComponent] = (),
-    stated: Adjustment | None = None,
+    weights: tuple[Tables, Tables] | None = None,
 ) -> list[Finding]:
     """Report components caused by blunders, missing convergence, and groups whose component is not estimable.
 
-    `stated`: adjustment with the stated standard deviations, to report their factors and the change of sigma of c.
+    `weights`: tables with the stated and with the estimated standard deviations, to report the factors, the change of
+    sigma of c, and what else would explain the residuals.
     """
     found = []
     for component in blunders:
@@ -491,47 +492,37 @@ def component_findings(
         )
     if not components.converged:
         found.append(Finding("components_not_converged", "warning", value=components.iterations))
-    elif stated is not None and components.supported.any():
-        found.append(_estimated_weights(components, stated))
-        before = Tables(stated)
-        found += input_findings(before, found)
-        found += _other_explanations(before, Tables(components.adjusted))
+    elif weights is not None and components.supported.any():
+        stated, estimated = weights
+        found.append(_estimated_weights(components, stated, estimated))
+        found += input_findings(stated, found)
+        found += _other_explanations(stated, estimated)
     return found + [Finding("component", "warning", sentence) for sentence in components.warnings.values()]
 
 
-def _estimated_weights(components: statistics.VarianceComponents, stated: Adjustment) -> Finding:
-    """Report the factors of the standard deviations, and the sigma of c with and without them.
+def _estimated_weights(components: statistics.VarianceComponents, stated: Tables, estimated: Tables) -> Finding:
+    """Report the factors of the standard deviations, and the sigma of the first c with and without them.
 
     Only those of matched image points are usually unknown: factors of other groups are a warning.
     """
-    factors = {
-        label: float(np.sqrt(f))
-        for label, f, supported in zip(components.labels, components.factor, components.supported, strict=True)
-        if supported
-    }
+    of_parts = zip(components.labels, np.sqrt(components.factor).tolist(), components.supported, strict=True)
+    factors = {label: factor for label, factor, supported in of_parts if supported}
     worst = max(factors, key=lambda label: abs(np.log(factors[label])))
     usual = all(label.startswith(IMAGE_POINTS) and ANOTHER_UNIT < f < NOTHING_FITS for label, f in factors.items())
-    sigmas = []
-    for adjusted in (components.adjusted, stated):
-        labels = [label for label in adjusted.structure.labels if label.endswith(".c_mm")]
-        shared = np.asarray(statistics.covariance(adjusted).shared_sigma)
-        sigmas.append([float(shared[adjusted.structure.labels.index(label)]) for label in labels])
-    effects = [
-        f"; {label} {new:.2g} mm instead of {old:.2g} mm" for label, new, old in zip(labels, *sigmas, strict=True)
-    ]
+    labels, effect = estimated.adjusted.structure.labels, ""
+    if path := next((label for label in labels if label.endswith(".c_mm")), ""):
+        new, old = (float(t.covariance.shared_sigma[labels.index(path)]) for t in (estimated, stated))
+        effect = f"; sigma of {path} {new:.2g} mm instead of {old:.2g} mm"
     subject = few([f"{label.replace('_', ' ')} {f:.3g}" for label, f in factors.items()])
-    numbers = {"effect": effects[0].replace("; ", "; sigma of ") if effects else ""}
     severity: Severity = "note" if usual else "warning"
-    return Finding("weights", severity, subject, factors[worst], 1.0, numbers=numbers)
+    return Finding("weights", severity, subject, factors[worst], 1.0, numbers={"effect": effect})
 
 
 def _other_explanations(stated: Tables, estimated: Tables) -> Iterator[Finding]:
     """Report effects and outliers that are significant with the stated, but not with the estimated weights."""
-    subjects, outliers = (
-        [{e.subject for e in _systematic(t, True)} for t in (stated, estimated)],
-        [{(s.group, s.row) for s in t.blunders.suspects} for t in (stated, estimated)],
-    )
-    causes = sorted(subjects[0] - subjects[1])
+    effects = [{e.subject for e in _systematic(t, True)} for t in (stated, estimated)]
+    outliers = [{(s.group, s.row) for s in t.blunders.suspects} for t in (stated, estimated)]
+    causes = sorted(effects[0] - effects[1])
     if n := len(outliers[0] - outliers[1]):
         causes.append(counted(n, "outlier"))
     if causes:

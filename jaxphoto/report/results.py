@@ -47,6 +47,7 @@ from jaxphoto.report.page import (
     verdict_parts,
     versions,
 )
+from jaxphoto.report.residual_findings import component_tables
 from jaxphoto.report.tables import (
     Tables,
     check_spread,
@@ -54,7 +55,7 @@ from jaxphoto.report.tables import (
     side_by_side,
     with_correlated_sigma,
 )
-from jaxphoto.statistics import LEVEL, global_test
+from jaxphoto.statistics import LEVEL, VarianceComponents, global_test
 from jaxphoto.statistics.block_geometry import format_coverage
 from jaxphoto.unknowns import Weighted
 from jaxphoto.writing import whole_folder
@@ -93,12 +94,13 @@ def write_results(
     record: CommandRecord | None = None,
     *,
     with_page: bool = True,
+    components: VarianceComponents | None = None,
 ) -> None:
     """Write the files of docs/block_folder.md into `directory`. Complete results replace earlier ones.
 
     summary.json contains `seconds` (read, compile, solve, covariance) and `entries` (options and inputs). `record` is
-    the provenance in the report. `with_page`: write the report, which takes a third of the time. Raises the errors of
-    `whole_folder`.
+    the provenance in the report. `with_page`: write the report, which takes a third of the time. `components`: variance
+    components, for their tables. Raises the errors of `whole_folder`.
     """
     began = time.perf_counter()
     with whole_folder(directory) as work:
@@ -106,6 +108,8 @@ def write_results(
             getattr(tables, name).to_csv(work / f"{name}.csv", index=False)
             # Return memory to the system: a table of millions of rows leaves hundreds of MB.
             return_freed_memory()
+        for name, table in (component_tables(components) if components else {}).items():
+            table.to_csv(work / f"{name}.csv", index=False)
         if with_page:
             factor = float(entries.get("sigma_factor", 1.0))
             (work / "report.html").write_text(report_page(tables, verdict, record, seconds, factor), encoding="utf-8")
