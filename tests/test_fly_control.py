@@ -56,7 +56,7 @@ def test_a_flight_is_brought_onto_its_control(flown, tmp_path, monkeypatch, caps
     given = ("--c-mm", 3.7, "--pixel-mm", PIXEL_MM, "--features", 500, "--control", flown / "survey.csv")
     told = ("--control-epsg", CODE, "--marks", flown / "marks.csv")
     _, said, wrong = run(monkeypatch, capsys, "fly", flown / "photographs", "--out", out, *given, *told)
-    assert "control points bring the block to their frame" in said, said + wrong
+    assert "control points define the frame of the block" in said, said + wrong
     summary = json.loads((out / "summary.json").read_text())["parts"][0]
     assert summary["epsg"] == CODE and summary["control"]["control"]["points"] == 5, summary
     points = pd.read_csv(out / "result" / "surveyed_points.csv")

@@ -3,6 +3,7 @@
 import dataclasses
 import math
 from collections.abc import Callable
+from functools import partial
 from typing import Any
 
 import equinox as eqx
@@ -71,7 +72,12 @@ def each_batch(body: Callable, carry: Any, numbers: Any, used: Array, into: Any 
     if found is None:
         like = jax.eval_shape(lambda c: body(c, at(numbers, 0))[1], carry)
         found = jax.tree.map(lambda v: jnp.zeros((count, *v.shape), v.dtype), like)
-    return jax.lax.fori_loop(0, used, step, (carry, found))
+
+    # A scan, unlike a loop of `used` steps, can be differentiated in reverse.
+    def only_used(state: tuple[Any, Any], k: Array) -> tuple[tuple[Any, Any], None]:
+        return jax.lax.cond(k < used, partial(step, k), lambda state: state, state), None
+
+    return jax.lax.scan(only_used, (carry, found), jnp.arange(count))[0]
 
 
 class PaddedStructure(AbstractStructure):
