@@ -22,11 +22,11 @@ from jaxphoto.procedures.georeference_photographs import (
     georeference_photographs,
     with_fixed_datum,
 )
-from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
+from jaxphoto.procedures.known_lens import Contradiction, KnownLens, contradiction, with_known_lens
 from jaxphoto.procedures.orientation import Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA, Report
 from jaxphoto.procedures.rolling_shutter import NEIGHBOUR_M, Moment, with_rolling_shutter
-from jaxphoto.statistics import Selection, VarianceComponents, variance_components
+from jaxphoto.statistics import CorrelatedNoise, Selection, VarianceComponents, correlated_noise, variance_components
 
 # Number of random vectors of the trace estimate. Each is expensive with 1e5 image points, and a few suffice for few
 # variance components.
@@ -107,12 +107,16 @@ class FlightPart(NamedTuple):
     components: VarianceComponents | None
     """Variance components of image points, stations and marks, if the adjustment converged."""
     adjusted: Adjustment
+    noise: CorrelatedNoise | None
+    """Spatially correlated errors of the image points, if the adjustment converged."""
     controlled: ControlledBlock | None = None
     """Block adjusted with the given control."""
     no_control: str = ""
     """Reason for unused control."""
     lens: tuple[str, ...] = ()
     """Messages about the prior information about the lens, if used."""
+    lens_rejected: tuple[Contradiction, ...] = ()
+    """Priors of the lens that contradict the images, and are not used."""
     why_no_shutter: str = ""
     """Reason why a requested rolling shutter was not estimated."""
 
@@ -166,12 +170,29 @@ def calibrate_flight(
 def _calibrated(
     matched: MatchedPart, sensor: Sensor, interior: InteriorOrientation, prior: KnownOfFlight, report: Report
 ) -> FlightPart:
-    title, lens = f"flight of {len(matched.names)} photographs", prior.lens
+    title = f"flight of {len(matched.names)} photographs"
     oriented = orient(
         matched.names, sensor, interior, matched.xy_mm, matched.pairs, matched.sigma_mm, title=title, report=report
     )
+    part = _adjusted(oriented, matched, prior, (), report)
+    # Focal lengths in EXIF may be those of another format (cropped pictures, video).
+    while part.noise is not None and (found := contradiction(part.adjusted, part.noise, CAMERA)):
+        part = _adjusted(oriented, matched, prior, (*part.lens_rejected, found), report)
+    return part
+
+
+def _adjusted(
+    oriented: Oriented,
+    matched: MatchedPart,
+    prior: KnownOfFlight,
+    rejected: tuple[Contradiction, ...],
+    report: Report,
+) -> FlightPart:
+    """Georeference and adjust an oriented part, without the `rejected` priors of the lens."""
+    lens = prior.lens
     if lens is not None:
-        oriented = oriented._replace(block=with_known_lens(oriented.block, CAMERA, lens))
+        without = [one.parameter for one in rejected]
+        oriented = oriented._replace(block=with_known_lens(oriented.block, CAMERA, lens, without))
     report("adjusting")
     placed, why_not, controlled, no_control = None, "", None, ""
     if prior.control is not None and prior.control.local:
@@ -212,10 +233,11 @@ def _calibrated(
         components = variance_components(adjusted, _component_parts(adjusted, marked), probes=_PROBES)
         # Variance components are not used unless their estimation converged; the report states this.
         adjusted = components.adjusted if bool(components.adjusted.converged) else adjusted
+    noise = correlated_noise(adjusted) if bool(adjusted.converged) else None
     return FlightPart(
-        oriented, matched, placed, why_not, components, adjusted,
+        oriented, matched, placed, why_not, components, adjusted, noise,
         retest(controlled, adjusted) if controlled else None, no_control,
-        lens.sentences(oriented.block, CAMERA) if lens else (), why_no_shutter,
+        lens.sentences(oriented.block, CAMERA) if lens else (), rejected, why_no_shutter,
     )  # fmt: skip
 
 

@@ -2,12 +2,15 @@
 
 import dataclasses
 import math
+from collections.abc import Collection
 from typing import NamedTuple
 
+from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block
 from jaxphoto.camera import InteriorOrientation, get_parameter, parameter_names, set_parameter
 from jaxphoto.camera.lens_prior import LensPrior, prior_sigmas
 from jaxphoto.observations import KnownParameters
+from jaxphoto.statistics import CorrelatedNoise, critical_w
 from jaxphoto.unknowns import FIXED, Weighted
 
 # Temperature difference (K) between flights of different seasons.
@@ -45,8 +48,8 @@ def has_prior(block: Block, camera: str) -> bool:
     return any(label.startswith(f"interior[{camera}].") for label in labels)
 
 
-def with_known_lens(block: Block, camera: str, lens: KnownLens) -> Block:
-    """Weight all free parameters of the camera by the prior information about its lens.
+def with_known_lens(block: Block, camera: str, lens: KnownLens, without: Collection[str] = ()) -> Block:
+    """Weight all free parameters of the camera, except `without`, by the prior information about its lens.
 
     Fixed parameters, and cameras with an earlier calibration, are unchanged.
     """
@@ -55,8 +58,51 @@ def with_known_lens(block: Block, camera: str, lens: KnownLens) -> Block:
     sigma = prior_sigmas(lens.prior, lens.nominal, block.sensors[camera], lens.c_rounding)
     priors = block.priors.interior[camera]
     for name in parameter_names(lens.nominal):
-        if get_parameter(priors, name) != FIXED and math.isfinite(sigma[name]):
+        if name not in without and get_parameter(priors, name) != FIXED and math.isfinite(sigma[name]):
             value = float(get_parameter(lens.nominal, name))
             priors = set_parameter(priors, name, Weighted(value, sigma[name]))
     interior = block.priors.interior | {camera: priors}
     return dataclasses.replace(block, priors=dataclasses.replace(block.priors, interior=interior))
+
+
+class Contradiction(NamedTuple):
+    """Prior value of a parameter that contradicts all other observations."""
+
+    parameter: str
+    prior: Weighted
+    value: float
+    """Estimate without this prior."""
+    sigma: float
+
+    @property
+    def words(self) -> str:
+        """Describe prior and estimate."""
+        given = f"{float(self.prior.value):.5g} +- {float(self.prior.sigma):.2g}"
+        return f"{self.parameter} {self.value:.5g} +- {self.sigma:.2g} without it, {given} by it"
+
+
+def contradiction(adjusted: Adjustment, noise: CorrelatedNoise, camera: str) -> Contradiction | None:
+    """Return the prior of the camera that most contradicts the other observations, if significantly.
+
+    With estimate x, variances q (independent errors) and s^2 (`noise`), and a prior p of variance p2, the estimate
+    without this prior is
+
+        x + (x - p) q / (p2 - q),    with variance (s^2 - q^2 / p2) (p2 / (p2 - q))^2.
+
+    Its difference from p, over the standard deviation of the difference, is tested at the level of blunders.
+    """
+    found: list[tuple[float, Contradiction]] = []
+    interior, priors = adjusted.unknowns.interior[camera], adjusted.block.priors.interior[camera]
+    for name in parameter_names(priors):
+        prior, label = get_parameter(priors, name), f"interior[{camera}].{name}"
+        if not isinstance(prior, Weighted) or label not in noise.labels:
+            continue
+        k, known = noise.labels.index(label), float(prior.sigma) ** 2
+        q, s2 = noise.independent[k, k], noise.covariance[k, k]
+        x, p = float(get_parameter(interior, name)), float(prior.value)
+        if q < known:
+            sigma = math.sqrt(max(s2 - q**2 / known, 0.0)) * known / (known - q)
+            value = x + (x - p) * q / (known - q)
+            found.append((abs(value - p) / math.hypot(sigma, prior.sigma), Contradiction(name, prior, value, sigma)))
+    largest = max(found, key=lambda one: one[0], default=None)
+    return largest[1] if largest and largest[0] > critical_w(len(found), adjusted.redundancy) else None

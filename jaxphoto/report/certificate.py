@@ -66,11 +66,6 @@ class Certified(NamedTuple):
     """True if all input files are known, not only the image files."""
 
     @property
-    def sigma_factor(self) -> float:
-        """Factor of the standard deviations for spatially correlated residuals; 1 if unknown."""
-        return max(1.0, float(self.summary.get("sigma_factor") or 1.0))
-
-    @property
     def files(self) -> list[InputFile]:
         """All known input files, by name."""
         return sorted(self.inputs)
@@ -123,11 +118,6 @@ def known_conditions(conditions: Sequence[Conditions]) -> dict[str, str]:
 
 def _camera(certified: Certified) -> Iterator[Part]:
     s, of = certified.sensor, certified.summary
-    if certified.sigma_factor > 1:
-        yield Paragraph(
-            "Residuals are spatially correlated: standard deviations and bands of this certificate are those of the "
-            f"adjustment times {certified.sigma_factor:.2f}."
-        )
     yield Heading("Camera, flight and conditions")
     names = ("images taken", *_NAMES, *(name for name, _, _ in _QUANTITIES))
     missing = _UNKNOWN if certified.conditions else "unknown: no image files were read"
@@ -164,10 +154,10 @@ def _method(certified: Certified) -> Iterator[Part]:
 
 def _interior(certified: Certified) -> Iterator[Part]:
     yield Heading("Interior orientation")
-    interior, pixel, factor = certified.interior, certified.sensor.pixel_mm, certified.sigma_factor
+    interior, pixel = certified.interior, certified.sensor.pixel_mm
     names, rows = parameter_names(interior), []
     sigmas = np.zeros(len(names)) if certified.covariance is None else np.sqrt(np.diagonal(certified.covariance))
-    for name, sigma in zip(names, sigmas * factor, strict=True):
+    for name, sigma in zip(names, sigmas, strict=True):
         value, in_px = float(get_parameter(interior, name)), ""
         if name.endswith("_mm"):
             in_px = with_sigma(value / pixel, sigma / pixel) + (f", {of_sigma(sigma / pixel)}" if sigma else "")
@@ -189,10 +179,10 @@ def _interior(certified: Certified) -> Iterator[Part]:
     yield Heading("Distortion")
     curve = distortion_curve(interior, certified.sensor, certified.covariance)
     alt = f"Radial distortion, at most {1e3 * np.abs(curve.radial).max():.3g} µm, with its 95 % band"
-    yield [Plot(partial(draw_distortion, curve=curve, factor=factor), alt)]
+    yield [Plot(partial(draw_distortion, curve=curve), alt)]
     columns = {"distance [mm]": curve.r, "radial [µm]": 1e3 * curve.radial}
     if curve.sigma is not None:
-        columns["95 % within +- [µm]"] = 1e3 * NORMAL_95 * factor * curve.sigma
+        columns["95 % within +- [µm]"] = 1e3 * NORMAL_95 * curve.sigma
     columns["decentring, affinity [µm]"] = 1e3 * curve.other
     yield pd.DataFrame(columns)[::_EVERY].map("{:.3f}".format)
     yield Paragraph(
@@ -207,7 +197,7 @@ def _precision(certified: Certified) -> Iterator[Part]:
     if covariance is None:
         yield Paragraph("Precision and correlations are unknown: no covariance.")
         return
-    points, scale = image_grid(certified.sensor, *_GRID), certified.sigma_factor / certified.sensor.pixel_mm
+    points, scale = image_grid(certified.sensor, *_GRID), 1 / certified.sensor.pixel_mm
     maps = {w: scale * frame_sigma(certified.interior, covariance, points, how) for how, w in _ALIGNMENTS}
     yield [_map(certified, points, sigma, f"sigma [px], {words}") for words, sigma in maps.items()]
     rows = [(w, *(f"{v:.3g}" for v in (s.min(), np.median(s), s.max()))) for w, s in maps.items()]

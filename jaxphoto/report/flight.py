@@ -46,7 +46,7 @@ from jaxphoto.report.photographs import (
 from jaxphoto.report.plots import arrow_key, axes_or_new, label, plot_links, title
 from jaxphoto.report.residual_findings import component_findings, component_tables
 from jaxphoto.report.results import adjustment_sections, coverage_words, summary_table, write_results, write_summary
-from jaxphoto.report.tables import Tables, estimates_table, with_correlated_sigma
+from jaxphoto.report.tables import Tables, estimates_table
 from jaxphoto.report.terminal import print_lines, print_sigma0, print_verdict
 from jaxphoto.report.verdict import lens_findings, shutter_findings, verdict_of
 from jaxphoto.writing import InputFile, digest_of_all, whole_folder
@@ -89,19 +89,18 @@ class PartReport(NamedTuple):
     out, none).
     """
 
-    @property
-    def sigma_factor(self) -> float:
-        """Factor of the camera's standard deviations for spatially correlated residuals; 1 if not significant."""
-        factor = self.part.oriented.report.alike
-        return factor if factor > CORRELATED else 1.0
-
 
 # Judgement -------------------------------------------------------------------------------------------------------
 
 
 def report_of(part: FlightPart) -> PartReport:
-    """Assess a part: adjustment, weights, lens, positions, control and correlated residuals."""
+    """Assess a part: adjustment, weights, lens, positions, control and correlated residuals.
+
+    Standard deviations of the camera and of other shared unknowns are those of correlated errors.
+    """
     tables = Tables(part.adjusted)
+    if part.noise is not None:
+        tables = Tables(part.adjusted, known=part.noise.widened(tables.covariance))
     found = [*verdict_of(tables).findings, *(component_findings(part.components) if part.components else [])]
     verdict = Verdict.of([*found, *lens_findings(tables), *_findings(part)])
     return PartReport(part, tables, verdict, _images(part))
@@ -123,8 +122,17 @@ def _findings(part: FlightPart) -> Iterator[Finding]:
     if part.placed and not part.placed.used.all():
         used = part.placed.used
         yield Finding("positions_rejected", "warning", value=int((~used).sum()), numbers={"n": len(used)})
-    if report.alike > CORRELATED:
-        yield Finding("correlated_residuals", "warning", value=report.alike, limit=CORRELATED)
+    factors = _camera_factors(part)
+    if max(factors, default=1.0) > CORRELATED:
+        yield Finding("correlated_residuals", "warning", f"{min(factors):.2g} to {max(factors):.2g}", max(factors))
+    for one in part.lens_rejected:
+        yield Finding("lens_prior_rejected", "warning", one.words)
+
+
+def _camera_factors(part: FlightPart) -> list[float]:
+    """Return the factors of the camera's standard deviations for correlated errors."""
+    factors = part.noise.factors if part.noise else {}
+    return [factor for label, factor in factors.items() if label.startswith("interior[")]
 
 
 def _images(part: FlightPart) -> pd.DataFrame:
@@ -159,25 +167,17 @@ def flight_verdict(flight: CalibratedFlight, reports: Sequence[PartReport], spoi
 
 
 def flight_estimates(report: PartReport, start: InteriorOrientation | None) -> pd.DataFrame:
-    """Tabulate the estimates of a part: parameter, initial (of the camera `start`), value, sigma, unit.
-
-    All standard deviations of the camera contain the factor of correlated residuals.
-    """
-    adjusted = report.part.adjusted
-    unknowns = adjusted.block.start.unknowns
+    """Tabulate the estimates of a part: parameter, initial (of the camera `start`), value, sigma, unit."""
+    unknowns = report.part.adjusted.block.start.unknowns
     if start is not None:
         unknowns = dataclasses.replace(unknowns, interior=dict.fromkeys(unknowns.interior, start))
-    table = estimates_table(report.tables, unknowns)
-    correlated = with_correlated_sigma(report.tables.interior, adjusted, report.sigma_factor)
-    paths = "interior[" + correlated["camera"].astype(str) + "]." + correlated["parameter"].astype(str)
-    sigma = dict(zip(paths, correlated["sigma_correlated"], strict=True))
-    return table.assign(sigma=table["parameter"].map(sigma).fillna(table["sigma"]))
+    return estimates_table(report.tables, unknowns)
 
 
 def sigma_words(report: PartReport) -> str:
     """Describe the standard deviations of the camera."""
-    factor = report.sigma_factor
-    return "a posteriori" + (f", times {factor:.2g} for correlated residuals" if factor > 1 else "")
+    correlated = max(_camera_factors(report.part), default=1.0) > CORRELATED
+    return "a posteriori" + (", for spatially correlated residuals" if correlated else "")
 
 
 def print_flight(
@@ -220,7 +220,7 @@ def flight_page(
         parts += [Heading("Unused images"), pd.DataFrame(unused, columns=["image", "reason"])]
     parts += [*positions_section(first, source), *surveyed_section(first)]
     parts += [Paragraph(as_sentence(s)) for s in (source.camera_from, *first.part.lens) if s]
-    parts += adjustment_sections(first.tables, source.start, first.sigma_factor)
+    parts += adjustment_sections(first.tables, source.start)
     parts += [
         Heading("Links between images"),
         [Plot(partial(plot_links, first.tables), "Network of images by common points", 4.4)],
@@ -420,11 +420,8 @@ def write_flight(
     for folder_name, r in zip(folders, reports, strict=True):
         times = {name: r.part.adjusted.seconds[name] for name in ("compile", "solve", "covariance")}
         with whole_folder(work / folder_name) as folder:
-            entries = {"sigma_factor": r.sigma_factor, "flight": coverage_words(r.tables)}
-            entries = {**source.entries, **entries}
+            entries = {**source.entries, "flight": coverage_words(r.tables)}
             write_results(r.tables, r.verdict, folder, times, entries, components=r.part.components)
-            correlated = with_correlated_sigma(r.tables.interior, r.part.adjusted, r.sigma_factor)
-            correlated.to_csv(folder / "interior_correlated.csv", index=False)
             if r.part.controlled:
                 write_control(r.part.controlled, folder)
             beside(r.part, folder)
@@ -448,7 +445,8 @@ def _summary(r: PartReport, number: int) -> dict:
     return {
         "verdict": r.verdict.colour, "block": part_folder(number, "block"), "result": part_folder(number),
         "n_images": len(r.part.adjusted.block.images), "n_image_points": report.n_image_points,
-        "n_points": report.n_points, "mean_px": report.mean_px, "alike": report.alike,
+        "n_points": report.n_points, "mean_px": report.mean_px,
+        "sigma_factors": r.part.noise.factors if r.part.noise else {},
         "epsg": r.part.adjusted.block.frame.code, "positions_used": int(placed.used.sum()) if placed else 0,
         "positions_left_out": [n for n, u in zip(placed.images, placed.used, strict=True) if not u] if placed else [],
         "sigma0": float(r.part.adjusted.sigma0),

@@ -60,10 +60,11 @@ def orientation_sentences(report: OrientationReport) -> list[str]:
     elif not report.converged:
         sentences.append("warning: the last adjustment did not converge; adjust with more iterations (--max-steps)")
     sentences.append(f"estimated camera parameters: {', '.join(report.estimated) or 'none'}")
-    if report.alike > CORRELATED:
+    factors = report.sigma_factors.values()
+    if max(factors, default=1.0) > CORRELATED:
         sentences.append(
-            f"residuals are spatially correlated: standard deviations of the camera are {report.alike:.2g} times those "
-            "of an adjustment of independent rays"
+            f"residuals are spatially correlated: standard deviations of the camera are {min(factors):.2g} to "
+            f"{max(factors):.2g} times those of independent residuals"
         )
     return sentences + list(report.observed)
 

@@ -402,15 +402,15 @@ def plot_distortion(tables: Tables, camera: str | None = None, ax: Axes | None =
     return ax
 
 
-def draw_distortion(axes: Axes, curve: DistortionCurve, factor: float = 1.0) -> None:
-    """Draw radial and other distortion (um); its 95 % half-width times `factor`, thinner than a line, on the right."""
+def draw_distortion(axes: Axes, curve: DistortionCurve) -> None:
+    """Draw radial and other distortion (um); its 95 % half-width, thinner than a line, on the right."""
     lines = [
         *axes.plot(curve.r, 1e3 * curve.radial, "-", color="#08519c", label="radial"),
         *axes.plot(curve.r, 1e3 * curve.other, "--", color="#d95f02", label="decentring, affinity"),
     ]
     if curve.sigma is not None:
         half_width = axes.twinx()
-        half = 1e3 * NORMAL_95 * factor * curve.sigma
+        half = 1e3 * NORMAL_95 * curve.sigma
         lines += half_width.plot(curve.r, half, ":", color="tab:green", label="95 % of radial (right)")
         half_width.set(ylabel="95 % within +- [µm]", ylim=(0, None))
     axes.axhline(0, color="0.6", lw=0.6)

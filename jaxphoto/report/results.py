@@ -53,7 +53,6 @@ from jaxphoto.report.tables import (
     check_spread,
     recovery_spread,
     side_by_side,
-    with_correlated_sigma,
 )
 from jaxphoto.statistics import LEVEL, VarianceComponents, global_test
 from jaxphoto.statistics.block_geometry import format_coverage
@@ -111,8 +110,7 @@ def write_results(
         for name, table in (component_tables(components) if components else {}).items():
             table.to_csv(work / f"{name}.csv", index=False)
         if with_page:
-            factor = float(entries.get("sigma_factor", 1.0))
-            (work / "report.html").write_text(report_page(tables, verdict, record, seconds, factor), encoding="utf-8")
+            (work / "report.html").write_text(report_page(tables, verdict, record, seconds), encoding="utf-8")
         summary = summary_of(tables, verdict, seconds | {"write": time.perf_counter() - began})
         write_summary(summary | dict(entries), work)
 
@@ -220,12 +218,8 @@ def report_page(
     verdict: Verdict,
     record: CommandRecord | None = None,
     seconds: Mapping[str, float] = MappingProxyType({}),
-    factor: float = 1.0,
 ) -> str:
-    """Return the report as HTML: verdict, at most three findings, summary with times (`seconds`), then all sections.
-
-    `factor`: factor of the standard deviations of the camera for correlated residuals.
-    """
+    """Return the report as HTML: verdict, at most three findings, summary with times (`seconds`), then all sections."""
     block = tables.adjusted.block
     summary = summary_table(tables)
     if weights := [f.subject for f in verdict.findings if f.code == "weights"]:
@@ -247,7 +241,7 @@ def report_page(
             Heading("Further findings"),
             without_empty(table.assign(finding=fact, unit=units, **numbers)[columns]),
         ]
-    parts += adjustment_sections(tables, factor=factor)
+    parts += adjustment_sections(tables)
     if record:
         parts += provenance(record)
         if block.converted_from:
@@ -306,14 +300,12 @@ def coverage_words(tables: Tables) -> dict[str, str]:
     return rows
 
 
-def adjustment_sections(
-    tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0
-) -> Iterator[Part]:
-    """Yield all sections of an adjustment. `start`: initial camera; `factor`: factor of its standard deviations.
+def adjustment_sections(tables: Tables, start: InteriorOrientation | None = None) -> Iterator[Part]:
+    """Yield all sections of an adjustment. `start`: initial camera.
 
     Without scale, columns in metres have the unit `Tables.unit`.
     """
-    for part in _sections(tables, start, factor):
+    for part in _sections(tables, start):
         if isinstance(part, pd.DataFrame) and tables.unit != "m":
             yield part.rename(columns=lambda name: re.sub(r"_m$", f" [{tables.unit}]", str(name))).replace(
                 {"unit": {"m": tables.unit}}
@@ -322,10 +314,10 @@ def adjustment_sections(
             yield part
 
 
-def _sections(tables: Tables, start: InteriorOrientation | None, factor: float) -> Iterator[Part]:
+def _sections(tables: Tables, start: InteriorOrientation | None) -> Iterator[Part]:
     a, cameras = tables.adjusted, plotted_cameras(tables)
     mapped = [camera for camera in tables.sigma_maps if camera in cameras]
-    yield from _interior(tables, cameras, start, factor)
+    yield from _interior(tables, cameras, start)
     if mapped:
         yield Heading("Distortion and projection uncertainty over the image format")
         yield Paragraph(
@@ -336,9 +328,7 @@ def _sections(tables: Tables, start: InteriorOrientation | None, factor: float) 
         )
         for camera in mapped:
             curve, words = plots.distortion_of(tables, camera), camera_words(camera)
-            row = [
-                Plot(partial(plots.draw_distortion, curve=curve, factor=factor), f"distortion of {words} by distance")
-            ]
+            row = [Plot(partial(plots.draw_distortion, curve=curve), f"distortion of {words} by distance")]
             sensor = a.block.sensors[camera]
             for one in tables.sigma_maps[camera]:
                 px = one.worst[np.isfinite(one.worst)] / sensor.pixel_mm
@@ -381,15 +371,12 @@ def plotted_cameras(tables: Tables) -> list[str]:
     return [camera for camera in cameras if len(cameras) <= _PLOTTED or camera in most]
 
 
-def interior_table(tables: Tables, start: InteriorOrientation | None = None, factor: float = 1.0) -> pd.DataFrame:
-    """Tabulate interior parameters: initial value, estimate, sigmas before and after, significance.
-
-    `factor`: factor of the standard deviations for correlated residuals (`with_correlated_sigma`).
-    """
-    table = with_correlated_sigma(tables.interior, tables.adjusted, factor)
+def interior_table(tables: Tables, start: InteriorOrientation | None = None) -> pd.DataFrame:
+    """Tabulate interior parameters: initial value, estimate, sigmas before and after, significance."""
+    table = tables.interior
     rows = []
     for p in table[table["sigma"].notna() | (table["value"] != 0)].to_dict("records"):
-        name, pixel, sigma = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma_correlated"]
+        name, pixel, sigma = p["parameter"], tables.adjusted.block.sensors[p["camera"]].pixel_mm, p["sigma"]
         first = start or tables.adjusted.block.start.unknowns.interior[p["camera"]]
         priors = tables.adjusted.priors.interior[p["camera"]]
         prior = get_parameter(priors, name) if name in parameter_names(priors) else None
@@ -406,15 +393,10 @@ def interior_table(tables: Tables, start: InteriorOrientation | None = None, fac
     return shown if len(tables.adjusted.unknowns.interior) > 1 else shown.drop(columns="camera")
 
 
-def _interior(
-    tables: Tables, cameras: Sequence[str], start: InteriorOrientation | None, factor: float
-) -> Iterator[Part]:
+def _interior(tables: Tables, cameras: Sequence[str], start: InteriorOrientation | None) -> Iterator[Part]:
     yield Heading("Interior orientation")
-    yield interior_table(tables, start, factor)
-    correlated = f", for spatially correlated residuals (factor {factor:.2g})" if factor > 1 else ""
-    yield Paragraph(
-        f"x to the right and y up from the centre of the format. Standard deviations are a posteriori{correlated}."
-    )
+    yield interior_table(tables, start)
+    yield Paragraph("x to the right and y up from the centre of the format. Standard deviations are a posteriori.")
     yield from assumed_pixels(tables.adjusted.block.sensors)
     for camera in cameras:
         reached, words = format_coverage(tables.adjusted, camera), camera_words(camera)

@@ -24,7 +24,7 @@ from jaxphoto.statistics.block_geometry import Coverage, coverage, intersection_
 from jaxphoto.statistics.correlation import FORMS
 from jaxphoto.statistics.sigma_map import SigmaMap, sigma_maps
 from jaxphoto.tracing import refuse_traced
-from jaxphoto.unknowns import Unknowns, Weighted
+from jaxphoto.unknowns import Unknowns
 
 # Median cosine of the tilt above which images are near-vertical (45 degrees).
 NEAR_VERTICAL = 0.7
@@ -519,23 +519,6 @@ def side_by_side(table: pd.DataFrame, rows: list[str], column: str, value: str) 
     named = table.assign(**{column: table[column].map(symbol)})
     wide = named.pivot_table(value, rows, column, aggfunc="first", sort=False).reset_index()
     return wide if len(wide["camera"].unique()) > 1 else wide.drop(columns="camera")
-
-
-def with_correlated_sigma(interior: pd.DataFrame, adjusted: Adjustment, factor: float) -> pd.DataFrame:
-    """Add the column `sigma_correlated`: standard deviations for spatially correlated residuals.
-
-    The information of the rays is divided by `factor`^2, the information of priors is not. With sigma s and prior p,
-    the rays alone give 1 / d^2 = 1 / s^2 - 1 / p^2; `sigma_correlated` combines p and `factor` d, parameter by
-    parameter.
-    """
-    weights = []
-    for camera, parameter in interior[["camera", "parameter"]].itertuples(index=False):
-        prior = get_parameter(adjusted.block.priors.interior[camera], parameter)
-        weights.append(1 / float(prior.sigma) ** 2 if isinstance(prior, Weighted) else 0.0)
-    before, sigma = np.array(weights), interior["sigma"].to_numpy(float)
-    total = before + np.maximum(1 / sigma**2 - before, 0.0) / max(factor, 1.0) ** 2
-    scaled = np.where(total > 0, 1 / np.sqrt(np.where(total > 0, total, 1.0)), sigma)
-    return interior.assign(sigma_correlated=np.where(np.isfinite(sigma), np.maximum(scaled, sigma), np.nan))
 
 
 def recovery_table(tables: Tables, truth: Mapping[str, pd.DataFrame]) -> pd.DataFrame:

@@ -9,6 +9,7 @@ from jaxphoto.statistics.blunder_test import (
     critical_w,
     multiple_outlier_test,
 )
+from jaxphoto.statistics.correlated_noise import CorrelatedNoise, correlated_noise
 from jaxphoto.statistics.correlation import (
     Correlations,
     GroundCorrelations,
@@ -88,16 +89,16 @@ from jaxphoto.statistics.variance_components import (
 __all__ = [
     "DELTA0", "EOP_NAMES", "LEAST_CHECKED", "LEAST_SIGMA0", "LEVEL", "MAX_GROUPS",
     "SIGNIFICANCE_LEVEL", "SIGNIFICANT_RATIO", "SPLITS", "UNCHECKED", "AxisErrors", "BlunderTest",
-    "CameraDifferences", "CameraDrift", "Correlations", "Covariance", "EffectTerm",
+    "CameraDifferences", "CameraDrift", "CorrelatedNoise", "Correlations", "Covariance", "EffectTerm",
     "EffectTest", "ErrorSizes", "GroundCorrelations", "MdbEffects", "Partition", "Parts", "Redundancy", "Rotations",
     "Selection", "Significance", "Suspect", "SystematicEffect", "TermEstimate", "VarianceComponents", "VarianceFactor",
     "ZeroTest",
     "a_priori_sigmas", "angle_differences", "blunder_test", "camera_drifts", "camera_spline_differences",
-    "check_discrepancies", "chi_square_limit", "chi_square_p", "common_covariance", "correlation_matrix",
-    "correlations", "covariance", "critical_w", "error_sizes", "expected_residual_scale", "fix_at_zero", "global_test",
-    "ground_correlations", "group_factors", "largest_interior_effects", "largest_mdbs", "linear_forms",
-    "mdb_effects", "minimal_detectable_biases", "multiple_outlier_test", "normalised_residuals",
-    "observation_groups", "part_factors", "partial_redundancy", "partition_observations", "physical_residuals",
-    "point_differences", "prepare_hat_matrix", "prepare_statistics", "redundancy_numbers", "residual_spread",
-    "significance", "strip_differences", "systematic_effect_tests", "variance_components",
+    "check_discrepancies", "chi_square_limit", "chi_square_p", "common_covariance", "correlated_noise",
+    "correlation_matrix", "correlations", "covariance", "critical_w", "error_sizes", "expected_residual_scale",
+    "fix_at_zero", "global_test", "ground_correlations", "group_factors", "largest_interior_effects",
+    "largest_mdbs", "linear_forms", "mdb_effects", "minimal_detectable_biases", "multiple_outlier_test",
+    "normalised_residuals", "observation_groups", "part_factors", "partial_redundancy", "partition_observations",
+    "physical_residuals", "point_differences", "prepare_hat_matrix", "prepare_statistics", "redundancy_numbers",
+    "residual_spread", "significance", "strip_differences", "systematic_effect_tests", "variance_components",
 ]  # fmt: skip

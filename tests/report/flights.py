@@ -5,7 +5,7 @@ import functools
 import numpy as np
 import pandas as pd
 
-from jaxphoto import Tables
+from jaxphoto import covariance
 from jaxphoto.adjustment import MINIMAL_SIZES
 from jaxphoto.camera.conditions import Conditions
 from jaxphoto.initial.matches import MatchedPart
@@ -14,7 +14,8 @@ from jaxphoto.procedures.georeference_photographs import GeoreferencedPhotograph
 from jaxphoto.procedures.orientation import Oriented
 from jaxphoto.procedures.orientation.orient_photographs import GrossErrors, OrientationReport
 from jaxphoto.report.findings import Finding, Verdict
-from jaxphoto.report.flight import FlightSource, PartReport
+from jaxphoto.report.flight import FlightSource, PartReport, report_of
+from jaxphoto.statistics import CorrelatedNoise
 from jaxphoto.writing import InputFile
 from tests.blocks import BROWN, adjusted
 
@@ -32,20 +33,27 @@ def part_report() -> PartReport:
     block, n = found.block, len(found.block.images)
     report = OrientationReport(
         n, 500, 20, block.images, {}, GrossErrors(0, 3, 2, 1, 0, 4), len(block.points), 300, 2,
-        True, True, 2.0, 0.5, 1.0, ("c_mm",), (), 1.5,
+        True, True, 2.0, 0.5, 1.0, ("c_mm",), (), {"c_mm": 1.5},
     )  # fmt: skip
     placed = GeoreferencedPhotographs(block, block.images[:4], OFFSETS_M, np.array([True] * 3 + [False]), ())
     matched = MatchedPart(
         list(block.images), [np.zeros((k + 5, 2)) for k in range(n)], [], [], np.zeros((0, 3), int), 1.0
     )
     residuals = np.asarray(found.residuals.image).T * np.asarray(block.image_points.sigma)
-    part = FlightPart(Oriented(block, residuals, report, MINIMAL_SIZES), matched, placed, "", None, found)
+    # All standard deviations of the camera are 1.5 times those of independent errors.
+    stated = covariance(found)
+    independent = np.asarray(stated.matrix)[6 * n :, 6 * n :]
+    correlated = 1.5**2 * float(found.sigma0) ** 2 * independent
+    noise = CorrelatedNoise(
+        (), np.zeros(0), found.structure.labels, correlated, correlated, independent, float(found.sigma0)
+    )
+    part = FlightPart(Oriented(block, residuals, report, MINIMAL_SIZES), matched, placed, "", None, found, noise)
     d = np.full((n, 3), np.nan)
     d[:4] = OFFSETS_M
     images = pd.DataFrame({"image": block.images, "n_image_points": np.bincount(found.structure.image, minlength=n)})
     images = images.assign(rms_px=np.linspace(0.3, 1.2, n), dX_m=d[:, 0], dY_m=d[:, 1], dZ_m=d[:, 2])
     images = images.assign(position=["used"] * 3 + ["left out"] + ["none"] * (n - 4))
-    return PartReport(part, Tables(found), VERDICT, images)
+    return PartReport(part, report_of(part).tables, VERDICT, images)
 
 
 def source() -> FlightSource:

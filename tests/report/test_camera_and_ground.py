@@ -12,10 +12,11 @@ from jaxphoto.adjustment.iteration_log import step_lines
 from jaxphoto.camera import Brown, InteriorOrientation, set_parameter
 from jaxphoto.camera.lens_prior import lens_prior, prior_sigmas
 from jaxphoto.observations import KnownParameters
-from jaxphoto.procedures.known_lens import KnownLens, with_known_lens
+from jaxphoto.procedures.known_lens import KnownLens, contradiction, with_known_lens
 from jaxphoto.report.results import convergence_words
-from jaxphoto.report.tables import convergence_table, side_by_side, with_correlated_sigma
+from jaxphoto.report.tables import convergence_table, side_by_side
 from jaxphoto.report.verdict import lens_findings, shutter_findings
+from jaxphoto.statistics import correlated_noise
 from tests.blocks import SENSOR, adjusted, simulated
 
 LENS = KnownLens(InteriorOrientation(35.0, 0.0, 0.0, Brown()), lens_prior("Canon", "Canon EOS 5D"), 0.01)
@@ -43,21 +44,24 @@ def test_all_that_is_estimated_is_observed_and_an_earlier_calibration_counts_mor
     assert "earlier calibration" in said
 
 
-def test_rays_that_err_alike_widen_what_they_say_and_not_what_was_known():
+def test_a_focal_length_of_another_format_is_not_used():
+    """With a prior of c far from what control and stations give, c is estimated as if it were free."""
     found = adjusted("cross")
-    priors = set_parameter(found.block.priors.interior["one"], "c_mm", Weighted(35.0, 0.02))
-    priors = set_parameter(priors, "k1", FREE)
-    block = dataclasses.replace(found.block, priors=dataclasses.replace(found.block.priors, interior={"one": priors}))
-    rows = [("one", "c_mm", 35.0, 0.012), ("one", "k1", 1e-5, 1e-6), ("one", "p1", 0.0, np.nan)]
-    table = pd.DataFrame(rows, columns=["camera", "parameter", "value", "sigma"])
-    wide = (
-        with_correlated_sigma(table, dataclasses.replace(found, block=block), 2.0)
-        .set_index("parameter")
-        .sigma_correlated
-    )
-    # 1 / 0.012^2 = 1 / 0.02^2 + 1 / 0.015^2; the rays' 0.015 become 0.030.
-    assert wide["c_mm"] == pytest.approx(1 / np.sqrt(1 / 0.02**2 + 1 / 0.03**2))
-    assert wide["k1"] == pytest.approx(2e-6) and np.isnan(wide["p1"])
+    block = with_known_lens(found.block, "one", LENS)
+    true = jaxphoto.adjust(block)
+    assert contradiction(true, correlated_noise(true), "one") is None
+    c, sigma = float(LENS.nominal.c), float(block.priors.interior["one"].c.sigma)
+    free = set_parameter(block.priors.interior["one"], "c_mm", FREE)
+    wrong = set_parameter(free, "c_mm", Weighted(c + 10 * sigma, sigma))
+    priors = {name: dataclasses.replace(block.priors, interior={"one": p}) for name, p in (("f", free), ("w", wrong))}
+    right = jaxphoto.adjust(dataclasses.replace(block, priors=priors["f"]))
+    pulled = jaxphoto.adjust(dataclasses.replace(block, priors=priors["w"]))
+    one = contradiction(pulled, correlated_noise(pulled), "one")
+    free_sigma = float(jaxphoto.covariance(right).of_interior("one", ["c_mm"])[0, 0]) ** 0.5
+    assert one is not None and one.parameter == "c_mm"
+    assert one.value == pytest.approx(float(right.unknowns.interior["one"].c), abs=0.3 * free_sigma)
+    again = with_known_lens(found.block, "one", LENS, ["c_mm"]).priors.interior["one"]
+    assert again.c == found.block.priors.interior["one"].c and again.distortion.k1.sigma > 0
 
 
 def test_a_block_that_does_not_tell_c_is_warned_of():

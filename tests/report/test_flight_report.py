@@ -24,6 +24,7 @@ from jaxphoto.report.flight import (
     provenance_section,
 )
 from jaxphoto.report.results import interior_table
+from jaxphoto.report.tables import Tables
 from tests.blocks import BROWN
 from tests.report.flights import OFFSETS_M, VERDICT, part_report, source
 
@@ -47,7 +48,7 @@ def test_the_verdict_is_first_then_linked_contents_of_all_sections(page):
 def test_standard_deviations_of_the_camera_contain_the_factor_of_correlated_residuals():
     report = part_report()
     table = flight_estimates(report, BROWN).set_index("parameter")
-    interior = report.tables.interior.dropna(subset="sigma")
+    interior = Tables(report.part.adjusted).interior.dropna(subset="sigma")
     for one in interior.itertuples():
         row = table.loc[f"interior[{one.camera}].{one.parameter}"]
         assert row["sigma"] == pytest.approx(1.5 * one.sigma) and row["value"] == one.value
@@ -84,13 +85,12 @@ def test_lost_photographs_and_what_was_computed_how_are_named(page):
 
 def test_initial_and_estimated_camera_are_shown():
     report = part_report()
-    rows = interior_table(report.tables, BROWN, 1.5).set_index("parameter")
+    rows = interior_table(report.tables, BROWN).set_index("parameter")
     table = report.tables.interior.set_index("parameter")
     assert float(rows.loc["c_mm", "initial"]) == BROWN.c
     c, sigma = table.loc["c_mm", ["value", "sigma"]].astype(float)
     assert float(rows.loc["c_mm", "value"]) == pytest.approx(c, abs=0.09 * sigma)
-    # Without priors, correlated residuals widen all of sigma.
-    assert float(rows.loc["c_mm", "sigma"]) == pytest.approx(1.5 * sigma, rel=0.05)
+    assert float(rows.loc["c_mm", "sigma"]) == pytest.approx(sigma, rel=0.05)
 
 
 def test_offsets_by_axis():

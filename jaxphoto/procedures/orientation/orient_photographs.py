@@ -11,39 +11,32 @@ spread and its standard deviation. At depth discontinuities neighbours spread wi
 
 During the iteration every parameter is observed at its initial value with a standard deviation of 3 % of the image
 radius in the corner of the format, the principal distance with 10 %: real lenses deviate by a few times these values.
-The parameters that the images determine follow from the covariance of the adjustment without these observations. The
-others, the weakest first, remain observed in the block.
-
-Residuals of neighbouring rays are correlated if lens, rolling shutter or features have unmodelled errors. Standard
-deviations of independent rays are then too small by the square root of the design effect (Kish),
-
-    d = sum over cells (sum over the rays of a cell v)^2 / sum over all rays v^2,
-
-which is 1 for independent residuals v, and the number of rays per cell for residuals that are equal within cells.
+The parameters that the images determine follow from the covariance of the adjustment without these observations, for
+spatially correlated errors of the image points (`correlated_noise`). The others, the weakest first, remain observed in
+the block.
 """
 
 import dataclasses
 from collections.abc import Callable, Sequence
 from typing import NamedTuple
 
-import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
 import scipy
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Bool, Float
 
-from jaxphoto.adjustment import Adjustment, NormalEquations, PaddedSizes, common_sizes, solve
+from jaxphoto.adjustment import Adjustment, PaddedSizes, common_sizes, solve
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import InteriorOrientation, Sensor, get_parameter, parameter_names, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
-from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import BlockError, camera_words
 from jaxphoto.initial.matches import PairMatches
 from jaxphoto.initial.rays import ideal_coordinates
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints
 from jaxphoto.procedures.orientation.colmap import MappedCamera, Network, map_images
 from jaxphoto.short_repr import pretty_repr
+from jaxphoto.statistics import correlated_noise
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted, default_priors
 from jaxphoto.variants import some_images, without_observations
 
@@ -52,8 +45,6 @@ from jaxphoto.variants import some_images, without_observations
 _LENS, _C, _FREE = 0.03, 0.1, 0.3
 # Maximum ratio of the standard deviation of a determined parameter to its prior one.
 _DETERMINED = 0.5
-# Number of cells along the longer side of an image.
-_CELLS = 8
 
 
 class SelfCalibration(NamedTuple):
@@ -98,8 +89,8 @@ class Determined(NamedTuple):
     names: tuple[str, ...]
     observed: list[str]
     """Reasons why other parameters remain observed, one message each."""
-    correlation_factor: float
-    """Factor of their standard deviations due to the correlation of neighbouring residuals."""
+    sigma_factors: dict[str, float]
+    """Factors of the standard deviations of all parameters due to spatially correlated errors of image points."""
 
 
 def self_calibration(block: Block, camera: str) -> SelfCalibration:
@@ -132,16 +123,17 @@ def corner_shift(interior: InteriorOrientation, name: str, corner: np.ndarray) -
 
 def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined:
     """Select the parameters of `calibration` that images determine; in `adjusted` all of them are observed."""
-    factor = correlation_factor(adjusted.block, np.asarray(adjusted.residuals.image))
-    matrix, labels = shared_covariance(adjusted), adjusted.structure.labels
-    camera, names = calibration.camera, calibration.names
-    place = [labels.index(f"interior[{camera}].{name}") for name in names]
+    noise, camera, names = correlated_noise(adjusted), calibration.camera, calibration.names
+    place = [noise.labels.index(f"interior[{camera}].{name}") for name in names]
     priors = [calibration.observation(name) for name in names]
     sigma = np.array([float(prior.sigma) for prior in priors])
     loose = np.array([_FREE * calibration.unit[name] for name in names])
-    # Normal equations of the image points alone.
-    images = np.linalg.inv(matrix[np.ix_(place, place)]) - np.diag(sigma**-2.0)
-    weak = undetermined(names, images / (float(adjusted.sigma0) * factor) ** 2, sigma, loose)
+    # Without priors the estimates have the covariance N^-1 B N^-1, with N the normal matrix of the image points and B
+    # the covariance of its right-hand side.
+    weights = np.linalg.inv(noise.independent)
+    right = (weights @ noise.of_images @ weights)[np.ix_(place, place)]
+    images = weights[np.ix_(place, place)] - np.diag(sigma**-2.0)
+    weak = undetermined(names, images @ np.linalg.solve(right, images), sigma, loose)
     return Determined(
         tuple(name for name in names if name not in weak),
         [
@@ -151,33 +143,8 @@ def determined(adjusted: Adjustment, calibration: SelfCalibration) -> Determined
             for name, prior in zip(names, priors, strict=True)
             if name in weak
         ],
-        factor,
+        {name: noise.factors[noise.labels[k]] for name, k in zip(names, place, strict=True)},
     )
-
-
-def correlation_factor(block: Block, residuals: Float[np.ndarray, "2 rows"]) -> float:
-    """Return the square root of the design effect of the `residuals` of image rows, both axes together; at least 1."""
-    rows, sensors = block.image_points, [block.sensors[camera] for camera in block.image_camera]
-    half = np.array([(s.width_mm, s.height_mm) for s in sensors])[rows.image] / 2
-    side = 2 * half.max(axis=1, keepdims=True) / _CELLS
-    place = np.clip((np.asarray(rows.xy) + half) // side, 0, _CELLS - 1).astype(int)
-    cell = (np.asarray(rows.image) * _CELLS + place[:, 0]) * _CELLS + place[:, 1]
-    sums = np.stack([np.bincount(cell, v) for v in residuals])
-    return float(np.sqrt(max(1.0, np.sum(sums**2) / np.sum(residuals**2))))
-
-
-def shared_covariance(adjusted: Adjustment) -> np.ndarray:
-    """Return the a priori covariance of the unknowns that images share, independent of the datum."""
-    equations, n = adjusted.equations, adjusted.structure.n_shared
-    scale = np.asarray(equations.scale.shared)
-    inverse = np.asarray(call_compiled(_inverse, equations))[-n:, -n:]
-    return inverse * np.outer(scale, scale)
-
-
-@eqx.filter_jit
-def _inverse(equations: NormalEquations) -> Float[Array, "reduced reduced"]:
-    # Avoid statistics.covariance: with all points its compilation takes several times longer.
-    return equations.inverse_of_reduced()
 
 
 def undetermined(
@@ -276,8 +243,8 @@ class OrientationReport(NamedTuple):
     """Parameters of the interior orientation that are free in the block."""
     observed: tuple[str, ...]
     """Reasons why other parameters remain observed at their initial values, one message each."""
-    alike: float
-    """Factor of the camera's standard deviations due to the correlation of neighbouring residuals."""
+    sigma_factors: dict[str, float]
+    """Factors of the camera's standard deviations due to spatially correlated errors of image points, by parameter."""
 
 
 @pretty_repr
@@ -356,7 +323,7 @@ def orient(
             sigma0=float(last.adjusted.sigma0),
             estimated=camera.names,
             observed=tuple(camera.observed),
-            alike=camera.correlation_factor,
+            sigma_factors=camera.sigma_factors,
         ),
         calibration.sizes,
     )
