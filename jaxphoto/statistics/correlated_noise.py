@@ -22,7 +22,7 @@ from itertools import islice
 from typing import NamedTuple
 
 import numpy as np
-import scipy.optimize
+import scipy
 from jaxtyping import Float, Int
 
 from jaxphoto.adjustment import Adjustment
