@@ -27,7 +27,7 @@ from numpy.polynomial import legendre
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
-from jaxphoto.block import exposures, mountings
+from jaxphoto.block import Block, exposures, mountings
 from jaxphoto.camera import (
     InteriorOrientation,
     RollingShutter,
@@ -44,6 +44,7 @@ from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.hat_matrix import HatMatrix
 from jaxphoto.statistics.quantiles import beta_tail
+from jaxphoto.unknowns import Unknowns
 
 Places = Mapping[str, Int[np.ndarray, "..."]]
 # Maximum number of matrix elements for fifth-degree polynomials over the format; larger blocks use third degree.
@@ -298,15 +299,15 @@ def _by_strip(
     yield effect("as a whole", means, cure, group=name, **common)
 
     if rows.unit == "m" and set(axes) <= set(AXES):
-        number, speed = (axis[..., None] == np.array(AXES)).argmax(axis=-1), _speed(adjusted)
-        body = _object_from_body(adjusted)[image, number]
+        number, speed = (axis[..., None] == np.array(AXES)).argmax(axis=-1), flight_speed(block, adjusted.unknowns)
+        body = body_attitudes(block, adjusted.unknowns)[image, number]
         arms = [(a, body[..., k]) for k, a in enumerate(("right", "forward", "up"))]
         offset = f" or time offset (1 s is {speed:.3g} m forward)" if speed else ""
         yield effect("along the axes of the aircraft", arms, _CURE_OF_ARM.format(offset), **common)
     elif set(axes) == set(ATTITUDE_AXES):
         number = (axis[..., None] == np.array(ATTITUDE_AXES)).argmax(axis=-1)
         # Residuals are rotations about the forward, right and down axes of the aircraft.
-        about = (_object_from_body(adjusted)[..., [1, 0, 2]] * [1.0, 1.0, -1.0])[image, :, number]
+        about = (body_attitudes(block, adjusted.unknowns)[..., [1, 0, 2]] * [1.0, 1.0, -1.0])[image, :, number]
         turns = [(a, about[..., k]) for k, a in enumerate(AXES)]
         yield effect("about the axes of the object frame", turns, _CURE_OF_NORTH, **common)
     if 1 < len(labels) <= MAX_GROUPS:
@@ -325,11 +326,11 @@ def _time(adjusted: Adjustment) -> Float[np.ndarray, "images"] | None:
     return (time - time.min()) / span - 0.5 if span > 0 else None
 
 
-def _object_from_body(adjusted: Adjustment) -> Float[np.ndarray, "images 3 3"]:
-    """Return the attitude of the aircraft at each image; the columns are its right, forward and up axes."""
-    mounts, _ = mountings(adjusted.block, adjusted.unknowns)
-    orientation = adjusted.unknowns.exterior.camera_from_object
-    return np.asarray(call_compiled(_bodies, orientation, mounts.boresight, exposures(adjusted.block).nominal))
+def body_attitudes(block: Block, unknowns: Unknowns) -> Float[np.ndarray, "images 3 3"]:
+    """Return `object_from_body` at each image; its columns are the right, forward and up axes of the aircraft."""
+    mounts, _ = mountings(block, unknowns)
+    orientation = unknowns.exterior.camera_from_object
+    return np.asarray(call_compiled(_bodies, orientation, mounts.boresight, exposures(block).nominal))
 
 
 @eqx.filter_jit
@@ -337,11 +338,10 @@ def _bodies(orientation: Array, boresight: Array, nominal: Array) -> Array:
     return jax.vmap(object_from_body)(orientation, boresight, nominal)
 
 
-def _speed(adjusted: Adjustment) -> float:
+def flight_speed(block: Block, unknowns: Unknowns) -> float:
     """Return the median speed between successive images of a strip (m/s); 0 if unknown."""
-    block, time = adjusted.block, np.asarray(adjusted.block.image_time)
-    strip, position = np.array(block.image_strip), np.asarray(adjusted.unknowns.exterior.position)
-    order = np.lexsort((time, strip))
+    time, strip = np.asarray(block.image_time), np.array(block.image_strip)
+    position, order = np.asarray(unknowns.exterior.position), np.lexsort((time, strip))
     step, distance = np.diff(time[order]), np.linalg.norm(np.diff(position[order], axis=0), axis=1)
     within = (strip[order][1:] == strip[order][:-1]) & (strip[order][1:] != "") & (step > 0)
     return float(np.median(distance[within] / step[within])) if within.any() else 0.0
