@@ -65,8 +65,8 @@ def contradicting_group(adjusted: Adjustment) -> Contradiction | None:
     if not found and set(both) <= set(single) and (trial := _without(adjusted.block, both)) is not None:
         return Contradiction(both, float(trial.sigma0), (), "")
     explained = sorted(((name, trial, _explanation(name, trial)) for name, trial in found), key=lambda e: not e[2])
-    if not explained or (len(explained) > 1 and not explained[0][2]):
-        # If any group may go and no correction is found, the adjustment failed for another reason.
+    if not explained or _agrees(adjust(adjusted.block, explained[0][1].unknowns)):
+        # From better initial values all observations agree: the adjustment failed for another reason.
         return None
     (name, trial, words), *rest = explained
     return Contradiction((name,), float(trial.sigma0), tuple(other for other, *_ in rest), words)
@@ -81,7 +81,11 @@ def _without(block: Block, groups: tuple[str, ...]) -> Adjustment | None:
             trial = adjust(block.with_observations(free))
     except JaxphotoError:
         return None
-    return trial if bool(trial.converged) and float(trial.sigma0) < _AGREE else None
+    return trial if _agrees(trial) else None
+
+
+def _agrees(adjusted: Adjustment) -> bool:
+    return bool(adjusted.converged) and float(adjusted.sigma0) < _AGREE
 
 
 def _explanation(name: str, trial: Adjustment) -> str:
