@@ -56,7 +56,7 @@ class CheckedColumns:
             return np.asarray(values)
         if values.dtype.kind not in "fiu":
             raise self.wrong(np.flatnonzero(np.ma.getmaskarray(values))[0], f"{column} is masked; remove the entry")
-        return values.astype(float).filled(np.nan)
+        return np.ma.filled(values.astype(float), np.nan)
 
     def _refuse_other_rows(self, given: Mapping[str, Any]) -> None:
         """Raise InputError for pandas Series with different indexes: their rows are matched by position here."""
