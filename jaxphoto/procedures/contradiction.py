@@ -159,12 +159,11 @@ def _common(observed: Float[np.ndarray, "n 3"], off: Float[np.ndarray, "n 3"]) -
                 continue
             moved = [AXES[k] for k in range(3) if order[k] != k]
             negative = [AXES[k] for k in range(3) if sign[k] < 0]
-            words = [f"{' and '.join(moved)} exchanged"] * bool(moved)
-            words += [f"the opposite sign of {' and '.join(negative)}"] * bool(negative)
-            left = changed - computed
-            yield _Correction(
-                f"with {' and '.join(words)}", _rms(left - np.median(left, axis=0)), len(moved + negative)
-            )
+            changes = [f"{' and '.join(moved)} exchanged"] * bool(moved)
+            changes += [f"the opposite sign of {' and '.join(negative)}"] * bool(negative)
+            new = changed - computed
+            left = _rms(new - np.median(new, axis=0))
+            yield _Correction(f"with {' and '.join(changes)}", left, len(moved + negative))
 
 
 def _of_flight(

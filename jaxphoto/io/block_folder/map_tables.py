@@ -111,7 +111,22 @@ def with_origin(frame: Frame, tables: Mapping[str, Table], trajectory: Records |
             f"{file}, [frame] origin: it is {distance / 1e3:.0f} km from the block, which is near "
             f"({middle[0]:.4f}, {middle[1]:.4f}) degrees; correct it or remove the key"
         )
+    _refuse_far_rows(tables, located, names)
     return located
+
+
+def _refuse_far_rows(tables: Mapping[str, Table], frame: Frame, names: tuple[str, ...]) -> None:
+    """Raise RowError for a row of surveyed or recorded coordinates that is far from the others."""
+    for table in (tables[name] for name in ("stations", "control_points", "images") if names[0] in tables[name]):
+        values = table.matrix(names, empty=True)
+        whole = np.flatnonzero(~np.isnan(values).any(axis=1))
+        distance = np.linalg.norm(frame.map.local(values[whole]), axis=1)
+        for line, far in zip(whole[distance > _FAR_M], distance[distance > _FAR_M], strict=True):
+            raise table.bad(
+                line,
+                f"the position is {far / 1e3:.0f} km from the block: a placeholder, or another zone of the map? "
+                "Correct or delete the row",
+            )
 
 
 def _converted(tables: ArrayLike, frame: Frame, back: bool, refuse: Refuse) -> ArrayLike:
