@@ -71,10 +71,10 @@ def estimate_weights(
         return None
     estimated: VarianceComponents | None = None
     chosen, kept = set[str](), set[str]()
-    if redundancy is None:
-        redundancy = redundancy_numbers(adjusted, covariance(adjusted, rows=True))
     while True:
         current = estimated.adjusted if estimated else adjusted
+        if redundancy is None:
+            redundancy = redundancy_numbers(current, covariance(current, rows=True))
         factors = _contradictions(current, parts, redundancy)
         contradicting = [f for f in factors if f.group not in kept | chosen]
         if not contradicting:
@@ -88,12 +88,9 @@ def estimate_weights(
         labels = [label for label in parts.labels if label in chosen | new]
         trial = variance_components(adjusted, parts.only(labels), max_steps=max_steps)
         kept |= new
-        if not trial.converged:
-            continue
-        of_trial = redundancy_numbers(trial.adjusted, covariance(trial.adjusted, rows=True))
-        if not (too_small and _has_another_cause(current, redundancy, trial.adjusted, of_trial, parts, new)):
+        if trial.converged and not (too_small and _has_another_cause(current, redundancy, trial, parts, new)):
             # With the new weights, parts that were kept may have a different cause.
-            estimated, chosen, kept, redundancy = trial, set(labels), set(trial.warnings), of_trial
+            estimated, chosen, kept, redundancy = trial, set(labels), set(trial.warnings), None
 
 
 def _contradictions(adjusted: Adjustment, parts: Parts, redundancy: Redundancy) -> list[VarianceFactor]:
@@ -106,18 +103,13 @@ def _contradictions(adjusted: Adjustment, parts: Parts, redundancy: Redundancy) 
 
 
 def _has_another_cause(
-    adjusted: Adjustment,
-    redundancy: Redundancy,
-    trial: Adjustment,
-    of_trial: Redundancy,
-    parts: Parts,
-    labels: set[str],
+    adjusted: Adjustment, redundancy: Redundancy, trial: VarianceComponents, parts: Parts, labels: set[str]
 ) -> bool:
     """Return True if blunders, or a shift or drift of a group, explain the large residuals of some parts.
 
-    `trial`: adjustment with their components, `adjusted`: without, with their redundancy numbers.
+    `trial`: adjustment with their components, `adjusted`: without.
     """
-    effects = _shifts_and_drifts(trial)
+    effects = _shifts_and_drifts(trial.adjusted)
     if any(e.p_value < LEVEL / len(effects) for e in effects):
         return True
     # A few observations with a common error have little weight in v'Pv with the new weights. With the old ones their
@@ -130,12 +122,11 @@ def _has_another_cause(
         p = beta_tail(min(e.explained / squares, 1.0), e.freedom / 2, (freedom - e.freedom) / 2)
         if p < LEVEL / len(effects):
             return True
-    # Observations with too much weight bend the block, and the residuals of some of them are large like blunders.
-    w = normalised_residuals(trial, of_trial)
+    w = normalised_residuals(adjusted, redundancy)
     for label in labels:
         k = parts.labels.index(label)
         of_part = np.concatenate([np.abs(w[name][part == k]) for name, part in parts.part_of.items()])
-        squares = (float(trial.sigma0) * of_part[np.isfinite(of_part)]) ** 2
+        squares = (float(adjusted.sigma0) * of_part[np.isfinite(of_part)]) ** 2
         if not len(squares) or squares.mean() > _FEW * np.median(squares) / _MEDIAN:
             return True
     return False

@@ -92,14 +92,6 @@ def test_a_common_shift_is_no_wrong_sigma():
     assert plan == pytest.approx(25.0, rel=0.5)
 
 
-def test_attitudes_with_far_too_much_weight_are_no_blunders():
-    """Standard deviations in radians under the name of degrees bend the block; single residuals look like blunders."""
-    block, *_ = calibration_flight()
-    estimated = estimate_weights(adjust(with_sigmas_times(block, {"attitudes": np.pi / 180})))
-    assert estimated.labels == ("attitudes",)
-    assert np.sqrt(estimated.factor[0]) == pytest.approx(180 / np.pi, rel=0.3)
-
-
 def test_image_points_that_fit_nothing_keep_their_weight(block):
     rows = block.image_points
     noise = 5 * np.asarray(rows.sigma) * np.random.default_rng(2).normal(size=np.shape(rows.xy))
