@@ -75,7 +75,7 @@ def contradicting_group(adjusted: Adjustment) -> Contradiction | None:
 def _without(block: Block, groups: tuple[str, ...]) -> Adjustment | None:
     """Adjust without the weight of some groups; None if the others do not agree or determine no datum."""
     rows = block.named_observations
-    free = {name: rows[name].with_sigmas_times(np.asarray(_WITHOUT)) for name in groups}
+    free = {n: rows[n].with_sigmas_times(np.full(np.shape(rows[n].sigmas), _WITHOUT)) for n in groups}
     try:
         with warnings.catch_warnings(action="ignore"):
             trial = adjust(block.with_observations(free))
