@@ -91,7 +91,7 @@ def block_fields(
     start, known = _start(ids, CheckedColumns("points", points, "point", *_XYZ), by_role["control"], by_role["fixed"])
     placed = set(_XYZ + _ANGLES) <= set(listed.columns)
     position, angles = (listed.numbers(*c) if placed else np.zeros((len(names), 3)) for c in (_XYZ, _ANGLES))
-    strips = tuple(listed.ids("strip")) if "strip" in listed else ("",) * len(names)
+    strips = tuple(listed.ids("strip", empty=True)) if "strip" in listed else ("",) * len(names)
     used, zero = dict(mounts or {}), jnp.zeros(3)
     unknowns = Unknowns(
         {name: interior for name, (_, interior) in cameras.items()},

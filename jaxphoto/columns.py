@@ -1,7 +1,7 @@
 """Checked columns of a table in memory; errors name table, column and entry."""
 
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
@@ -20,6 +20,14 @@ class TableLike(Protocol):
     def __iter__(self) -> Iterator[str]: ...
 
 
+def _name(value: Any) -> str:
+    if isinstance(value, bytes):
+        return value.decode("utf-8", "replace").strip()
+    if isinstance(value, float):
+        return "" if np.isnan(value) else str(int(value)) if value.is_integer() else str(value)
+    return "" if value is None else str(value).strip()
+
+
 class CheckedColumns:
     """Checked columns of a table in memory; `name` appears in messages."""
 
@@ -27,7 +35,12 @@ class CheckedColumns:
         """Create from a table; None is an empty table with the columns `bare`."""
         self.name = name
         given: TableLike = dict.fromkeys(bare, ()) if columns is None else columns
-        self.columns = {str(key): np.asarray(given[key]) for key in given}
+        if isinstance(given, (Sequence, np.ndarray)):
+            raise InputError(
+                f"{name}: a {type(given).__name__} is no table; give a dictionary of columns or a DataFrame"
+            )
+        self._refuse_other_rows({str(key): given[key] for key in given})
+        self.columns = {str(key): self._array(str(key), given[key]) for key in given}
         lengths = {key: len(np.atleast_1d(column)) for key, column in self.columns.items()}
         if len(set(lengths.values())) > 1:
             listed = ", ".join(f"{key} {n}" for key, n in lengths.items())
@@ -37,16 +50,44 @@ class CheckedColumns:
     def __contains__(self, column: str) -> bool:
         return column in self.columns
 
+    def _array(self, column: str, values: Any) -> np.ndarray:
+        """Convert to an array; masked numbers are NaN."""
+        if not (isinstance(values, np.ma.MaskedArray) and np.ma.is_masked(values)):
+            return np.asarray(values)
+        if values.dtype.kind not in "fiu":
+            raise self.wrong(np.flatnonzero(np.ma.getmaskarray(values))[0], f"{column} is masked; remove the entry")
+        return np.ma.filled(values.astype(float), np.nan)
+
+    def _refuse_other_rows(self, given: Mapping[str, Any]) -> None:
+        """Raise InputError for pandas Series with different indexes: their rows are matched by position here."""
+        series = {key: values for key, values in given.items() if hasattr(values, "iloc")}
+        for key, values in series.items():
+            first, reference = next(iter(series.items()))
+            if len(values) == len(reference) and not values.index.equals(reference.index):
+                raise InputError(
+                    f"{self.name}: {first} and {key} are Series with different indexes; give one DataFrame, or "
+                    ".to_numpy() of each if their order is the same"
+                )
+
     def wrong(self, entry: int | np.integer, message: str) -> InputError:
         """Return an error about an entry, counted from 0."""
         return InputError(f"{self.name}, entry {entry}: {message}")
 
-    def ids(self, column: str) -> list[str]:
-        """Return names as text; numbers in their written form."""
-        return [str(v) for v in self._column(column).tolist()]
+    def ids(self, column: str, *, empty: bool = False) -> list[str]:
+        """Return names as text without surrounding blanks; whole numbers without decimals.
+
+        Raises InputError for an empty name, unless `empty`.
+        """
+        names = [_name(v) for v in self._column(column).tolist()]
+        if "" in names and not empty:
+            raise self.wrong(names.index(""), f"the {column} is empty; give its id or remove the entry")
+        return names
 
     def numbers(self, *columns: str, empty: bool = False) -> Float[np.ndarray, "n k"]:
-        """Return finite numbers, one column each; NaN is allowed if `empty`."""
+        """Return finite numbers, one column each; NaN is allowed if `empty`. Truth values and dates are no numbers."""
+        for c in columns:
+            if (dtype := self._column(c).dtype).kind in "bcmM":
+                raise InputError(f"{self.name}: the column {c} is {dtype}; give real numbers in the unit of its name")
         try:
             values = np.stack([np.asarray(self._column(c), float).reshape(self.n) for c in columns], axis=1)
         except (TypeError, ValueError) as error:

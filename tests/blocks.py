@@ -13,7 +13,7 @@ import equinox as eqx
 import jax
 import numpy as np
 
-from jaxphoto import FIXED, FREE, Outcome, Unknowns, Weighted, adjust, covariance, read_block
+from jaxphoto import FIXED, FREE, Outcome, Unknowns, Weighted, adjust, covariance, read_block, read_recipe
 from jaxphoto.block import Block, Datum, Start
 from jaxphoto.camera import Balanced, Brown, InteriorOrientation, Sensor, Smac, set_parameter
 from jaxphoto.collinearity import ExteriorOrientation
@@ -21,7 +21,7 @@ from jaxphoto.compiling.fast_compilation import jit_quickly
 from jaxphoto.georeferencing import Mount, Scanner, StripBias
 from jaxphoto.observations import Attitudes, CameraPositions, ControlCoordinates, Distances, ImagePoints, SurfaceRows
 from jaxphoto.rotation import small_rotation
-from jaxphoto.simulation import remeasure
+from jaxphoto.simulation import remeasure, simulate
 from jaxphoto.unknowns import default_priors
 from tests.formulas import camera_from_object, collinearity
 
@@ -454,3 +454,9 @@ def example() -> Block:
 def adjusted_example():
     """`example`, adjusted."""
     return adjust(example())
+
+
+@functools.cache
+def calibration_flight():
+    """Simulation of calibration_flight.toml: images, stations and attitudes of strips at two heights, and control."""
+    return simulate(read_recipe(Path(__file__).parent / "calibration_flight.toml"), seed=3)

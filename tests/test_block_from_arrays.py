@@ -158,6 +158,20 @@ def test_a_network_without_control_has_a_minimal_datum():
         ),
         ({"image_points": POINTS | {"x_mm": [1, 2, 3]}}, r"image_points: the columns differ in length"),
         ({"image_points": POINTS | {"x_mm": [1, 2, np.nan, 3]}}, r"image_points, entry 2: x_mm is nan; give a number"),
+        ({"image_points": [{"image": "a"}]}, r"image_points: a list is no table"),
+        ({"image_points": POINTS | {"point": [1, 1, None, 2]}}, r"image_points, entry 2: the point is empty"),
+        (
+            {
+                "image_points": pd.DataFrame(POINTS)[["image", "point", "x_mm"]].to_dict("series")
+                | {"y_mm": pd.Series(POINTS["y_mm"], [3, 2, 1, 0])}
+            },
+            r"image_points: image and y_mm are Series with different indexes",
+        ),
+        ({"stations": STATION | {"Z_m": [True]}}, r"stations: the column Z_m is bool; give real numbers"),
+        (
+            {"images": {"image": ["a", "b"], "time_s": pd.to_datetime(["2026-05-01", "2026-05-02"])}},
+            "time_s is datetime",
+        ),
         (
             {"image_points": POINTS | {"x_mm": [1, "2,5", 1, 3]}},
             r"image_points: x_mm, y_mm must have one number per entry",
@@ -187,6 +201,18 @@ def test_what_is_missing_or_wrong_is_named(changes, message):
     given = {"image_points": POINTS, "cameras": KODAK, "sigma_mm": 0.004} | changes
     with pytest.raises((InputError, BlockError), match=message):
         Block.of(given.pop("image_points"), given.pop("cameras"), **given)
+
+
+def test_names_and_gaps_as_libraries_write_them():
+    """HDF5 has bytes, pandas turns integers beside NaN into floats, netCDF masks what is missing."""
+    known = {"point": np.array([1.0, 2.0]), **columns(XYZ, [[1.0, 2, 3], [4, 5, 6]]), "sigma_m": [0.1, 0.1]}
+    known["Z_m"] = np.ma.masked_array([3.0, -9999.0], [False, True])
+    given = POINTS | {"image": np.array([b"a", b"b ", b"a", b"b"])}
+    block = Block.of(given, KODAK, sigma_mm=0.004, control=known)
+    assert block.images == ("a", "b") and block.points == ("1", "2")
+    assert list(zip(block.control.who, block.control.axis, block.control.value, strict=True)) == [
+        (0, 0, 1.0), (0, 1, 2.0), (0, 2, 3.0), (1, 0, 4.0), (1, 1, 5.0),
+    ]  # fmt: skip
 
 
 def test_check_points_need_no_sigma_and_fixed_ones_are_fixed():

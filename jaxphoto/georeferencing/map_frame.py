@@ -18,6 +18,8 @@ from jaxphoto.errors import InputError
 # Half of the step along a grid line that determines its direction (m, degrees): the rounding error is 1e-11 rad, the
 # effect of curvature smaller.
 _STEP_M, _STEP_DEG = 50.0, 5e-4
+# Maximum distance (degrees) of coordinates from the area of use of their system.
+_BEYOND_DEG = 3.0
 # Declaration of ellipsoidal heights in a block and in a flight, for messages.
 _ON_ELLIPSOID = 'vertical = "ellipsoidal" in block.toml, --heights ellipsoid of a flight'
 
@@ -123,6 +125,26 @@ def map_system(code: int) -> CRS:
 def check_heights(code: int, vertical: int) -> None:
     """Raise InputError if heights of the EPSG system `vertical` cannot be converted to the ellipsoid of `code`."""
     _to_place(code, vertical)
+
+
+def check_area(
+    code: int, places: Float[np.ndarray, "n 3"], file: str, coordinates: Float[np.ndarray, "n 3"], cure: str
+) -> None:
+    """Raise InputError if the median of `places`, of the `coordinates` in `file`, is outside the area of a system.
+
+    `places`: longitude and latitude (degrees), height; `cure` ends the message.
+    """
+    area = map_system(code).area_of_use
+    if area is None:
+        return
+    (longitude, latitude, _), (west, south, east, north) = np.median(places, axis=0), area.bounds
+    outside = west <= east and not west - _BEYOND_DEG <= longitude <= east + _BEYOND_DEG
+    if outside or not south - _BEYOND_DEG <= latitude <= north + _BEYOND_DEG or not np.isfinite(longitude):
+        about = ", ".join(f"{value:.1f}" for value in np.median(coordinates, axis=0)[:2])
+        raise InputError(
+            f"{file}: the coordinates, about ({about}), are outside the area of EPSG:{code} "
+            f"({area.name.split('.')[0]}); {cure}"
+        )
 
 
 def map_name(code: int, vertical: int | None) -> str:

@@ -19,7 +19,7 @@ from jaxtyping import Bool, Int
 from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block, Start, direct_exterior, sensor_rows
 from jaxphoto.camera import InteriorOrientation
-from jaxphoto.errors import BlockError, InputError
+from jaxphoto.errors import BlockError, InputError, counted
 from jaxphoto.initial.intersection import intersect_points
 from jaxphoto.initial.rays import camera_rays, directions_of, ideal_coordinates, turn_to_object
 from jaxphoto.initial.resection import resect_ideal
@@ -182,6 +182,13 @@ class _State:
         bad = np.flatnonzero(~_in_front(block, interior, self.positions, self.matrices, self.points))
         if len(bad):
             image, point = self.image[bad[0]], self.point[bad[0]]
+            surveyed = np.concatenate([block.control.who, block.fixed.who])
+            if np.isin(self.point[bad], surveyed).all() and not np.isin(self.point, surveyed).all():
+                raise PointsBehind(
+                    f"{counted(len(np.unique(self.point[bad])), 'control point')} and no other point lie behind the "
+                    f"images that measured them, such as {block.points[point]} and {block.images[image]}: check their "
+                    "coordinates, the units and the height reference"
+                )
             raise PointsBehind(
                 f"point {block.points[point]} lies behind image {block.images[image]}, which measured it ({len(bad)} "
                 f"of {len(self.image)} such image points): check the approximate angles and their units, the "

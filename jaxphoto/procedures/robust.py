@@ -260,7 +260,8 @@ def without_common_errors(
     """
     tested = systematic_effect_tests(adjusted, np.asarray(covariance(adjusted).shared_sigma))
     for trend in tested:
-        if trend.p_value < LEVEL / len(tested) and (axes := [h.term.name for h in trend.significant_terms]):
+        axes = [h.term.name for h in trend.significant_terms] if trend.pattern.group else []
+        if trend.p_value < LEVEL / len(tested) and axes:
             rows = block.named_observations[trend.pattern.group]
             out = {trend.pattern.group: np.any(np.isin(rows.axis_of_numbers, axes), axis=0)}
             yield out, partial(_without, block, start, max_steps, sizes, report, out)

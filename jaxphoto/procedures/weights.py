@@ -24,6 +24,7 @@ from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.errors import few
 from jaxphoto.statistics import (
     LEVEL,
+    EffectTest,
     Parts,
     Redundancy,
     VarianceComponents,
@@ -37,6 +38,7 @@ from jaxphoto.statistics import (
     systematic_effect_tests,
     variance_components,
 )
+from jaxphoto.statistics.quantiles import beta_tail
 from jaxphoto.tracing import outside_transformations
 
 _SPLITS = ("xy-z", "camera")
@@ -107,11 +109,19 @@ def _has_another_cause(
 
     `trial`: adjustment with their components, `adjusted`: without.
     """
-    effects = systematic_effect_tests(trial.adjusted, np.asarray(covariance(trial.adjusted).shared_sigma))
-    level = LEVEL / max(len(effects), 1)
-    # Tests of effects over the image format do not depend on the weight of the image points.
-    if any(e.p_value < level and not e.pattern.camera for e in effects):
+    effects = _shifts_and_drifts(trial.adjusted)
+    if any(e.p_value < LEVEL / len(effects) for e in effects):
         return True
+    # A few observations with a common error have little weight in v'Pv with the new weights. With the old ones their
+    # own v'Pv dominates: the same test on it is independent of their weight.
+    own = [f for f in part_factors(adjusted, parts, redundancy) if f.group in labels]
+    freedom = sum(f.redundancy for f in own)
+    squares = sum(f.factor * f.redundancy for f in own)
+    effects = [e for e in _shifts_and_drifts(adjusted) if e.freedom < freedom]
+    for e in effects:
+        p = beta_tail(min(e.explained / squares, 1.0), e.freedom / 2, (freedom - e.freedom) / 2)
+        if p < LEVEL / len(effects):
+            return True
     w = normalised_residuals(adjusted, redundancy)
     for label in labels:
         k = parts.labels.index(label)
@@ -120,3 +130,9 @@ def _has_another_cause(
         if not len(squares) or squares.mean() > _FEW * np.median(squares) / _MEDIAN:
             return True
     return False
+
+
+def _shifts_and_drifts(adjusted: Adjustment) -> list[EffectTest]:
+    """Test systematic effects. Those over the image format do not depend on the weight of the image points."""
+    effects = systematic_effect_tests(adjusted, np.asarray(covariance(adjusted).shared_sigma))
+    return [e for e in effects if not e.pattern.camera]

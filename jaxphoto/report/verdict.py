@@ -15,7 +15,8 @@ from jaxphoto.camera import RollingShutter, Sensor, ThermalRates, get_parameter
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words, few
 from jaxphoto.initial.approximate import in_front, looking_away
-from jaxphoto.procedures.adjust import left_out_words
+from jaxphoto.procedures.adjust import ABSURD, left_out_words
+from jaxphoto.procedures.contradiction import Contradiction, contradicting_group
 from jaxphoto.report.findings import Finding, Severity, Verdict, p_words
 from jaxphoto.report.formatting import of_sigma, path_words, plus_minus, symbol
 from jaxphoto.report.residual_findings import (
@@ -81,6 +82,11 @@ def _findings(tables: Tables) -> Iterator[Finding]:
         yield from _not_converged(adjusted)
         # Stop here: statistics are valid only at an optimum.
         return
+    if float(adjusted.sigma0) > ABSURD and (contradiction := contradicting_group(adjusted)) is not None:
+        yield _contradiction_finding(adjusted, contradiction)
+        if contradiction.explanation:
+            # Tests of an adjustment that is distorted so far name innocent observations.
+            return
     prepare_hat_matrix(adjusted)
     yield from (Finding("prior_information", "warning", doubt) for doubt in adjusted.block.prior_warnings)
     if adjusted.left_out:
@@ -114,15 +120,30 @@ def _findings(tables: Tables) -> Iterator[Finding]:
 
 
 def _not_converged(adjusted: Adjustment) -> Iterator[Finding]:
+    sigma0 = float(adjusted.sigma0)
+    if sigma0 > NOTHING_FITS and (contradiction := contradicting_group(adjusted)) is not None:
+        yield _contradiction_finding(adjusted, contradiction)
+        yield Finding("not_converged", "error", adjusted.outcome.value)
+        return
     yield Finding("not_converged", "error", adjusted.outcome.value)
     if names := [adjusted.block.points[p] for p in np.flatnonzero(adjusted.diverged_points)]:
         yield Finding("diverged_points", "error", few(names), len(names))
-    sigma0 = float(adjusted.sigma0)
     # Good fit without convergence indicates an undetermined direction, not poor initial values.
     if sigma0 <= NOTHING_FITS:
         yield from (Finding("undetermined", "error", w.sentence) for w in weaknesses_of(adjusted))
     elif np.isfinite(sigma0):
         yield Finding("nothing_fits", "error", value=sigma0, limit=NOTHING_FITS)
+
+
+def _contradiction_finding(adjusted: Adjustment, contradiction: Contradiction) -> Finding:
+    """Return the finding; a group that agrees by no known correction has the hint to check its file."""
+    c, names = contradiction, [name.replace("_", " ") for name in contradiction.groups]
+    others = f" (or without {few([name.replace('_', ' ') for name in c.others])})" if c.others else ""
+    numbers = {"others": others, "explanation": f"; they agree {c.explanation}" if c.explanation else ""}
+    hint = "" if c.explanation else f"Check {' and '.join(f'{name}.csv' for name in c.groups)}, or the trajectory"
+    return Finding(
+        "contradicting_group", "error", " and ".join(names), float(adjusted.sigma0), c.sigma0, hint, numbers=numbers
+    )
 
 
 def behind_findings(adjusted: Adjustment) -> Iterator[Finding]:

@@ -2,7 +2,8 @@
 
 Candidate effects. Over the format: polynomials of x and y up to the fifth degree (third in huge blocks); they contain
 the usual lens terms (k1, k2, p1, p2, affinity, shear) exactly and most smooth fields approximately. Over time: a linear
-change of the camera. For every group observed per image: a common mean, a mean per strip and a linear drift.
+change of the camera. For every group observed per image: a common mean, a mean per strip and a linear drift; for
+positions also a common mean along the axes of the aircraft, which a wrong lever arm or a time offset causes.
 
 Test. An effect G (one column per direction, whitened like the observations) that the model lacks changes u = G'v, which
 has the cofactors C = G' Q_vv P G of whitened observations. As an unknown, G b would be estimated by b = C^-1 u. If the
@@ -26,6 +27,7 @@ from numpy.polynomial import legendre
 
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
+from jaxphoto.block import Block, exposures, mountings
 from jaxphoto.camera import (
     InteriorOrientation,
     RollingShutter,
@@ -36,11 +38,13 @@ from jaxphoto.camera import (
 )
 from jaxphoto.compiling import call_compiled
 from jaxphoto.errors import camera_words
-from jaxphoto.observations import PRIORS, AbstractObservations, Correlated
+from jaxphoto.georeferencing import object_from_body
+from jaxphoto.observations import ATTITUDE_AXES, AXES, PRIORS, AbstractObservations, Correlated
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.discrepancy import observation_groups
 from jaxphoto.statistics.hat_matrix import HatMatrix
 from jaxphoto.statistics.quantiles import beta_tail
+from jaxphoto.unknowns import Unknowns
 
 Places = Mapping[str, Int[np.ndarray, "..."]]
 # Maximum number of matrix elements for fifth-degree polynomials over the format; larger blocks use third degree.
@@ -62,6 +66,8 @@ _CURE_OF_SHIFT = {
     'estimate a shift of the flight ([unknowns.flight_bias], shift = "free")',
     "rad": "on average: another angle convention, or a boresight: set it free",
 }
+_CURE_OF_ARM = "on average: a wrong lever arm{}; correct it in [mounts], or free it there"
+_CURE_OF_NORTH = "on average: another north (true, grid, magnetic) or vertical; compare with [frame] yaw"
 _CURE_OF_STRIP = "on average: estimate a shift of that strip, or check its recording and its camera"
 
 
@@ -103,6 +109,8 @@ class SystematicEffect(NamedTuple):
     """Beginning of the message; default "residuals of `what` follow a pattern"."""
     group: str = ""
     """Group in which all rows share the effect axis by axis; "" for other effects."""
+    report_all: bool = False
+    """True if messages report all significant terms instead of the one that explains most."""
     min_fraction: float = 1e-3
     """Minimum fraction of a direction that estimated parameters must leave for it to be tested. Smaller remainders are
     dominated by the curvature of the model.
@@ -277,15 +285,31 @@ def _by_strip(
     group = name.replace("_", " ")
 
     def effect(what: str, columns: list[tuple[str, np.ndarray]], cure: str, **options: Any) -> SystematicEffect:
-        parts = tuple(Part(at.ravel(), v.ravel()[None], weight.ravel()) for _, v in columns)
+        values = np.stack([v.ravel() for _, v in columns])
+        # Columns without common observations are parts of their own.
+        joint = (values != 0).sum(axis=0).max() > 1
+        parts = tuple(Part(at.ravel(), v, weight.ravel()) for v in ([values] if joint else values[:, None]))
         units = np.eye(len(columns))
         terms = tuple(EffectTerm(n, unit, cure) for (n, _), unit in zip(columns, units, strict=True))
         return SystematicEffect(f"{group} {what}", rows.unit, "", parts, terms, **options)
 
     means = [(str(a), (axis == a).astype(float)) for a in axes]
     cure = _CURE_OF_SHIFT.get(rows.unit, "")
-    yield effect("as a whole", means, cure, group=name, min_fraction=_MIN_FRACTION_OF_SHIFT)
+    common = {"report_all": True, "min_fraction": _MIN_FRACTION_OF_SHIFT}
+    yield effect("as a whole", means, cure, group=name, **common)
 
+    if rows.unit == "m" and set(axes) <= set(AXES):
+        number, speed = (axis[..., None] == np.array(AXES)).argmax(axis=-1), flight_speed(block, adjusted.unknowns)
+        body = body_attitudes(block, adjusted.unknowns)[image, number]
+        arms = [(a, body[..., k]) for k, a in enumerate(("right", "forward", "up"))]
+        offset = f" or time offset (1 s is {speed:.3g} m forward)" if speed else ""
+        yield effect("along the axes of the aircraft", arms, _CURE_OF_ARM.format(offset), **common)
+    elif set(axes) == set(ATTITUDE_AXES):
+        number = (axis[..., None] == np.array(ATTITUDE_AXES)).argmax(axis=-1)
+        # Residuals are rotations about the forward, right and down axes of the aircraft.
+        about = (body_attitudes(block, adjusted.unknowns)[..., [1, 0, 2]] * [1.0, 1.0, -1.0])[image, :, number]
+        turns = [(a, about[..., k]) for k, a in enumerate(AXES)]
+        yield effect("about the axes of the object frame", turns, _CURE_OF_NORTH, **common)
     if 1 < len(labels) <= MAX_GROUPS:
         columns = [(f"{a} of strip {s}", ((strips == s) & (axis == a)).astype(float)) for s in labels for a in axes]
         yield effect("from strip to strip", columns, _CURE_OF_STRIP)
@@ -300,6 +324,27 @@ def _time(adjusted: Adjustment) -> Float[np.ndarray, "images"] | None:
     time = np.asarray(block.image_time if block.flight_time is None else block.flight_time)
     span = np.ptp(time)
     return (time - time.min()) / span - 0.5 if span > 0 else None
+
+
+def body_attitudes(block: Block, unknowns: Unknowns) -> Float[np.ndarray, "images 3 3"]:
+    """Return `object_from_body` at each image; its columns are the right, forward and up axes of the aircraft."""
+    mounts, _ = mountings(block, unknowns)
+    orientation = unknowns.exterior.camera_from_object
+    return np.asarray(call_compiled(_bodies, orientation, mounts.boresight, exposures(block).nominal))
+
+
+@eqx.filter_jit
+def _bodies(orientation: Array, boresight: Array, nominal: Array) -> Array:
+    return jax.vmap(object_from_body)(orientation, boresight, nominal)
+
+
+def flight_speed(block: Block, unknowns: Unknowns) -> float:
+    """Return the median speed between successive images of a strip (m/s); 0 if unknown."""
+    time, strip = np.asarray(block.image_time), np.array(block.image_strip)
+    position, order = np.asarray(unknowns.exterior.position), np.lexsort((time, strip))
+    step, distance = np.diff(time[order]), np.linalg.norm(np.diff(position[order], axis=0), axis=1)
+    within = (strip[order][1:] == strip[order][:-1]) & (strip[order][1:] != "") & (step > 0)
+    return float(np.median(distance[within] / step[within])) if within.any() else 0.0
 
 
 def _in_format(sensor: Sensor, xy: Float[np.ndarray, "2 n"]) -> Float[np.ndarray, "2 n"]:
@@ -403,6 +448,8 @@ class EffectTest(NamedTuple):
     p_value: float
     size: float
     """Root mean square of the effect in the residuals, corrected for noise, in the unit of the observations."""
+    explained: float
+    """Reduction of v'Pv by the effect."""
     hints: tuple[TermEstimate, ...]
     """Estimated named terms, largest fraction first."""
     matching_blunders: int = 0
@@ -410,9 +457,9 @@ class EffectTest(NamedTuple):
 
     @property
     def significant_terms(self) -> list[TermEstimate]:
-        """Significant terms of an effect common to all rows of a group; empty for other effects."""
+        """Significant terms of an effect with `report_all`; empty for other effects."""
         significant = [h for h in self.hints if abs(h.amount) > SIGNIFICANT_RATIO * h.sigma]
-        return significant if self.pattern.group else []
+        return significant if self.pattern.report_all else []
 
 
 def systematic_effect_tests(
@@ -522,7 +569,8 @@ def _tested(
         values = hints[0].amount * (np.array(units) @ hints[0].term.coefficients)
         matching = int((np.abs(blunders.errors - values) < _MATCH * np.abs(values)).sum())
     label = pattern._replace(parts=())
-    return EffectTest(label, pattern.sigma, freedom, p, max(float(size2), 0.0) ** 0.5, tuple(hints), matching)
+    size = max(float(size2), 0.0) ** 0.5
+    return EffectTest(label, pattern.sigma, freedom, p, size, explained, tuple(hints), matching)
 
 
 def _hints(

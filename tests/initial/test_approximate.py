@@ -207,6 +207,18 @@ def test_a_point_behind_its_camera_is_named():
         approximate(block)
 
 
+def test_control_above_the_flight_is_named_as_such():
+    """Heights in feet: only the surveyed points lie behind the images."""
+    block, truth = strip()
+    block = with_known(block, truth, all_of(block.images), all_of(block.points))
+    wrong = block.start.unknowns.points.copy()
+    wrong[:3, 2] = 2000.0
+    control = coordinate_rows(wrong, range(3), (2,))
+    block = eqx.tree_at(lambda b: (b.start.unknowns.points, b.control), block, (wrong, control))
+    with pytest.raises(BlockError, match=r"3 control points"):
+        approximate(block)
+
+
 def test_a_coordinate_that_is_not_a_number_is_not_in_front():
     block, truth = strip()
     block = with_known(block, truth, all_of(block.images), all_of(block.points))

@@ -9,7 +9,7 @@ import pytest
 
 import jaxphoto
 from jaxphoto.block import Frame
-from jaxphoto.errors import BlockError, InputError
+from jaxphoto.errors import BlockError, InputError, RowError
 from jaxphoto.georeferencing import Corrections
 from jaxphoto.io import read_block, write_block
 from jaxphoto.observations import CameraPositions, PointRows, correlated
@@ -179,6 +179,18 @@ def test_one_table_outside_the_area_is_named(write_folder, origin):
     table.assign(X_m=table["Y_m"], Y_m=table["X_m"]).to_csv(folder / "stations.csv", index=False)
     with pytest.raises(InputError, match=r"^stations.csv: the coordinates.* outside the area of EPSG:32722"):
         read_block(folder)
+
+
+@pytest.mark.parametrize("place", [(0.0, 0.0), (E - 600_000.0, N)], ids=["placeholder", "zone"])
+def test_a_row_far_from_the_block_is_named(write_folder, place):
+    """Zeros of a receiver without a position, and coordinates in the zone beside."""
+    folder = to_utm(write_folder())
+    table = pd.read_csv(folder / "control_points.csv", dtype={"point": str})
+    table.loc[2, ["X_m", "Y_m"]] = place
+    table.to_csv(folder / "control_points.csv", index=False)
+    with pytest.raises(RowError, match=r"^control_points.csv, row 4: ") as caught:
+        read_block(folder)
+    assert caught.value.rows == {4}
 
 
 def test_incomplete_coordinates_are_refused(write_folder):

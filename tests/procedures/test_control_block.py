@@ -11,8 +11,10 @@ from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.observations import CameraPositions
 from jaxphoto.procedures.control import GivenControl, Marks, at_optimum, control_block
-from jaxphoto.procedures.control.control_block import check_handedness, onto_control
-from jaxphoto.procedures.control.marks import without_names
+from jaxphoto.procedures.control.control_block import check_handedness, check_units, onto_control
+from jaxphoto.procedures.control.marks import TURNED, intersected, turned_marks, without_names
+from jaxphoto.procedures.control.marks import marked as marked_rows
+from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from jaxphoto.simulation import image_coordinates
 from tests.blocks import free_network, simulated
 from tests.procedures.controlled import CHECK, CODE, CONTROL, ORIGIN, marked_block
@@ -193,6 +195,51 @@ def test_marks_of_resized_pictures_are_told_by_their_factor(marked, factor):
         found_in(marked, marked.control._replace(marks=resized))
     told = float(re.search(r"multiplied by ([\d.]+)", str(error.value))[1])
     assert told == pytest.approx(1 / factor, rel=0.01)
+
+
+@pytest.mark.parametrize("words", TURNED)
+def test_marks_by_another_convention_are_named_by_the_one_that_restores_them(marked, words):
+    """Such as rows from the bottom, or of pictures that a viewer turned by their EXIF orientation."""
+    control, sensor = marked.control, marked.block.sensors["one"]
+    size, steps = np.array([[sensor.width_px, sensor.height_px]], float), np.eye(2)
+    # Columns and rows that the convention converts into the true ones.
+    zero = TURNED[words](np.zeros((1, 2)), size)
+    turn = TURNED[words](steps, size) - zero
+    column_row = (control.marks.column_row - zero) @ np.linalg.inv(turn)
+    inside = ((column_row >= 0) & (column_row <= size)).all(axis=1)
+    assert inside.sum() > 6
+    rows, _ = marked_rows(marked.block, control.points, control.marks._replace(column_row=column_row))
+    start = marked.block.start.unknowns
+    good = intersected(marked.block, start, rows, control.points.ids).good
+    found = turned_marks(marked.block, start, rows, good)
+    restored = TURNED[found](column_row[inside], size)
+    np.testing.assert_allclose(restored, control.marks.column_row[inside], atol=1e-6)
+    true, _ = marked_rows(marked.block, control.points, control.marks)
+    assert turned_marks(marked.block, start, true, np.ones(len(true.image), bool)) is None
+
+
+@pytest.mark.parametrize("axis", [0, 2])
+def test_one_axis_of_the_control_in_another_unit_is_named_with_its_factor(axis):
+    rng = np.random.default_rng(7)
+    there = rng.uniform(-1.0, 1.0, (9, 3)) * [400.0, 300.0, 12.0]
+    turn = np.asarray(matrix_from_omega_phi_kappa(np.array([0.05, -0.03, 2.1])))
+    here = 100.0 + 1.7 * there @ turn.T + rng.normal(0, 0.02, there.shape)
+    check_units(there, here, "points.csv")
+    here[:, axis] /= 0.3048
+    with pytest.raises(InputError, match=f"if {'XYZ'[axis]} is multiplied") as error:
+        check_units(there, here, "points.csv")
+    assert float(re.search(r"multiplied by ([\d.]+)", str(error.value))[1]) == pytest.approx(0.3048, rel=0.01)
+    # One wrong point is no unit.
+    here[:, axis] *= 0.3048
+    here[4, axis] += 30.0
+    check_units(there, here, "points.csv")
+
+
+def test_control_outside_of_the_area_of_its_system_is_refused(marked):
+    """In feet, as the system of the file is metric: PROJ returns a position beyond the pole."""
+    xyz = marked.control.points.coordinates / 0.3048
+    with pytest.raises(InputError, match="outside the area of EPSG"):
+        found_in(marked, with_coordinates(marked.control, xyz))
 
 
 def test_flat_control_with_exchanged_axes_is_refused():

@@ -112,3 +112,14 @@ def test_a_cloud_elsewhere(folder, tmp_path, monkeypatch, capsys):
     given = ("lidar-control", folder, tmp_path / "far.laz", "--out", tmp_path / "out")
     code, _, error = run(monkeypatch, capsys, *given)
     assert code == 2 and "over the block" in error and error.count(" to ") >= 4
+
+
+@pytest.mark.filterwarnings("always::UserWarning")
+def test_a_cloud_that_contradicts_the_images_is_reported(folder, tmp_path, monkeypatch, capsys):
+    """Easting and northing exchanged: most points still have a surface below them, at a wrong height."""
+    las = laspy.read(folder / "cloud.laz")
+    las.x, las.y = np.array(las.y), np.array(las.x)
+    las.write(tmp_path / "cloud.laz")
+    given = ("lidar-control", folder, tmp_path / "cloud.laz", "--out", tmp_path / "out", *SIGMAS)
+    code, _, error = run(monkeypatch, capsys, *given)
+    assert code == 0 and "the cloud contradicts" in error

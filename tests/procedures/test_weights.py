@@ -11,7 +11,7 @@ from jaxphoto import adjust, covariance, estimate_weights, variance_components
 from jaxphoto.procedures.snooping import inflated_components
 from jaxphoto.report import component_findings
 from jaxphoto.simulation import remeasure
-from tests.blocks import adjusted_example, example, free_network
+from tests.blocks import adjusted_example, calibration_flight, example, free_network
 
 
 @pytest.fixture(scope="module")
@@ -75,6 +75,21 @@ def test_a_wrong_sigma_of_image_points_is_estimated_and_no_other(block, factor):
     # Standard deviations are those of the block with the right weights.
     sigmas = [np.asarray(covariance(a).shared_sigma) for a in (estimated.adjusted, adjusted)]
     np.testing.assert_allclose(*sigmas, rtol=0.1)
+
+
+def test_a_common_shift_is_no_wrong_sigma():
+    """Eight control points in another epoch: the shift explains their residuals, however little weight they have."""
+    block, *_ = calibration_flight()
+    shifted = np.asarray(block.control.value) + np.array([0.55, 0.45, 0.0])[block.control.axis]
+    adjusted = adjust(block.with_observations({"control_points": dataclasses.replace(block.control, value=shifted)}))
+    assert float(adjusted.sigma0) > 1.2 and estimate_weights(adjusted) is None
+    # Independent errors of the same size are a wrong sigma.
+    rng = np.random.default_rng(5)
+    noisy = np.asarray(block.control.value) + np.where(block.control.axis < 2, rng.normal(0, 0.5, len(shifted)), 0.0)
+    noisy = block.with_observations({"control_points": dataclasses.replace(block.control, value=noisy)})
+    estimated = estimate_weights(adjust(noisy))
+    plan = dict(zip(estimated.labels, np.sqrt(estimated.factor), strict=True))["control_points X-Y"]
+    assert plan == pytest.approx(25.0, rel=0.5)
 
 
 def test_image_points_that_fit_nothing_keep_their_weight(block):

@@ -12,12 +12,13 @@ from scipy import stats
 
 from jaxphoto import FIXED, Tables, adjust, covariance, read_block
 from jaxphoto.camera import get_parameter, set_parameter
+from jaxphoto.georeferencing import object_from_body
 from jaxphoto.observations.priors import KnownParameters
 from jaxphoto.report import verdict_of
 from jaxphoto.simulation import remeasure
 from jaxphoto.statistics import systematic_effect_tests, systematic_effects
 from jaxphoto.statistics.hat_matrix import HatMatrix
-from tests.blocks import Simulated, adjusted, free_network, observed, simulated
+from tests.blocks import Simulated, adjusted, calibration_flight, free_network, observed, simulated
 
 KNOWN = ("interior[one].c_mm", "interior[one].k1")
 
@@ -49,8 +50,8 @@ def test_where_nothing_is_missing_p_values_are_uniform():
     p = [{what: test.p_value for what, test in effects_in(b).items()} for b in blocks]
     assert set(p[0]) == {
         "image points of camera one over the format", "image points of camera one over time",
-        "prior information of camera one", "stations as a whole", "stations from strip to strip",
-        "stations over time",
+        "prior information of camera one", "stations as a whole", "stations along the axes of the aircraft",
+        "stations from strip to strip", "stations over time",
     }  # fmt: skip
     for what in p[0]:
         assert stats.kstest([each[what] for each in p], "uniform").pvalue > 1e-3, what
@@ -104,6 +105,45 @@ def test_stations_that_are_all_off_alike_are_named_before_any_single_one():
     assert abs(size - 48.0) < 2 * sigma < 2.0
     (hint,) = [t.hints[0] for t in tables.tested_trends if t.pattern.what == "stations as a whole"]
     assert abs(hint.amount - 48.0) < 3 * hint.sigma
+
+
+@pytest.mark.parametrize(
+    ("arm_m", "offset_s"), [((0.0, 0.0, 0.0), 0.02), ((0.24, -0.7, 2.4), 0.0)], ids=["time offset", "lever arm"]
+)
+def test_an_error_along_the_axes_of_the_aircraft_is_named_with_its_size(arm_m, offset_s):
+    """A time offset of 20 ms at 50 m/s; a lever arm of the wrong sign."""
+    block, truth, *_ = calibration_flight()
+    rows, mount = block.stations, truth.mounts["default"]
+    body = jax.vmap(object_from_body, (0, None, None))(
+        truth.exterior.camera_from_object, mount.boresight, mount.nominal
+    )
+    error = np.add(arm_m, [0.0, 50.0 * offset_s, 0.0])
+    value = np.asarray(rows.value) + (np.asarray(body) @ error)[rows.who, rows.axis]
+    tables = Tables(adjust(block.with_observations({"stations": dataclasses.replace(rows, value=value)})))
+    (test,) = (t for t in tables.tested_trends if t.pattern.what == "stations along the axes of the aircraft")
+    estimates = {h.term.name: h for h in test.hints}
+    for name, size in zip(("right", "forward", "up"), error, strict=True):
+        assert abs(estimates[name].amount - size) < 3 * estimates[name].sigma
+    assert test.significant_terms[0].term.name == ("forward" if offset_s else "up")
+    assert first_cause(tables) == test.pattern.what
+
+
+def test_another_north_is_named_although_the_boresight_absorbs_most_of_it():
+    """Yaw from magnetic north, clockwise: a rotation about the vertical of the opposite sign."""
+    block, *_ = calibration_flight()
+    turned = dataclasses.replace(
+        block.attitudes, roll_pitch_yaw=block.attitudes.roll_pitch_yaw + np.deg2rad([0.0, 0.0, 3.5])
+    )
+    tables = Tables(adjust(block.with_observations({"attitudes": turned})))
+    (test,) = (t for t in tables.tested_trends if t.pattern.what == "attitudes about the axes of the object frame")
+    assert test.hints[0].term.name == "Z" and np.rad2deg(test.hints[0].amount) == pytest.approx(-3.5, abs=0.1)
+    assert first_cause(tables) == test.pattern.what
+
+
+def first_cause(tables) -> str:
+    """Subject of the first finding that names a cause of large residuals."""
+    first = next(f for f in verdict_of(tables).findings if f.code in ("systematic", "blunder"))
+    return first.subject.removeprefix("systematic residuals of ")
 
 
 def test_blunders_have_no_part_in_patterns():

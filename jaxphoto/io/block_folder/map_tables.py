@@ -15,7 +15,7 @@ import pandas as pd
 
 from jaxphoto.block import Frame
 from jaxphoto.errors import BlockError, InputError
-from jaxphoto.georeferencing.map_frame import MapFrame, map_system
+from jaxphoto.georeferencing.map_frame import MapFrame, check_area
 from jaxphoto.io.block_folder.table_layout import ANGLES, ATTITUDE, TOML, VELOCITY, XYZ, coordinate_names
 from jaxphoto.io.text_tables import Table
 from jaxphoto.io.trajectory import Records
@@ -26,8 +26,6 @@ from jaxphoto.rotation import (
     roll_pitch_yaw_from_matrix,
 )
 
-# Maximum distance (degrees) of a block from the area of use of its system.
-_BEYOND = 3.0
 # Maximum distance (m) of the block from its origin; the vertical is tilted by 3 degrees there.
 _FAR_M = 3e5
 _PLACED = ("images", "control_points", "stations", "object_points")
@@ -84,17 +82,18 @@ def with_origin(frame: Frame, tables: Mapping[str, Table], trajectory: Records |
     assert frame.code is not None
     # Use a zero origin: longitude and latitude do not depend on it.
     system, names = MapFrame(frame.code, frame.vertical, (0.0, 0.0, 0.0)), coordinate_names(frame)
+    cure = f"correct the code in {TOML}, or the coordinates ({names[0]} is east, {names[1]} north)"
     placed: list[np.ndarray] = []
     for table in (tables[name] for name in _PLACED if all(column in tables[name] for column in names)):
         values = table.matrix(names, empty=True)
         values = values[~np.isnan(values).any(axis=1)]
         if len(values):
             placed.append(system.place(values))
-            _check_area(table.file, values, placed[-1], frame)
+            check_area(frame.code, placed[-1], table.file, values, cure)
     if trajectory is not None:
         values = trajectory.coordinates
         places = values if trajectory.geographic else system.place(values)
-        _check_area(trajectory.file, values, places, frame)
+        check_area(frame.code, places, trajectory.file, values, cure)
         placed = placed or [places]
     if not placed:
         if frame.origin is None:
@@ -112,23 +111,22 @@ def with_origin(frame: Frame, tables: Mapping[str, Table], trajectory: Records |
             f"{file}, [frame] origin: it is {distance / 1e3:.0f} km from the block, which is near "
             f"({middle[0]:.4f}, {middle[1]:.4f}) degrees; correct it or remove the key"
         )
+    _refuse_far_rows(tables, located, names)
     return located
 
 
-def _check_area(file: str, coordinates: np.ndarray, places: np.ndarray, frame: Frame) -> None:
-    """Raise InputError if the median of a file's `coordinates`, at `places`, is outside the area of the system."""
-    assert frame.code is not None
-    area, names = map_system(frame.code).area_of_use, coordinate_names(frame)
-    if area is None:
-        return
-    (longitude, latitude, _), (west, south, east, north) = np.median(places, axis=0), area.bounds
-    outside = west <= east and not west - _BEYOND <= longitude <= east + _BEYOND
-    if outside or not south - _BEYOND <= latitude <= north + _BEYOND or not np.isfinite(longitude):
-        about = ", ".join(f"{value:.1f}" for value in np.median(coordinates, axis=0)[:2])
-        raise InputError(
-            f"{file}: the coordinates, about ({about}), are outside the area of EPSG:{frame.code} ({area.name}); "
-            f"correct the code in {TOML}, or the coordinates ({names[0]} is east, {names[1]} north)"
-        )
+def _refuse_far_rows(tables: Mapping[str, Table], frame: Frame, names: tuple[str, ...]) -> None:
+    """Raise RowError for a row of surveyed or recorded coordinates that is far from the others."""
+    for table in (tables[name] for name in ("stations", "control_points", "images") if names[0] in tables[name]):
+        values = table.matrix(names, empty=True)
+        whole = np.flatnonzero(~np.isnan(values).any(axis=1))
+        distance = np.linalg.norm(frame.map.local(values[whole]), axis=1)
+        for line, far in zip(whole[distance > _FAR_M], distance[distance > _FAR_M], strict=True):
+            raise table.bad(
+                line,
+                f"the position is {far / 1e3:.0f} km from the block: a placeholder, or another zone of the map? "
+                "Correct or delete the row",
+            )
 
 
 def _converted(tables: ArrayLike, frame: Frame, back: bool, refuse: Refuse) -> ArrayLike:

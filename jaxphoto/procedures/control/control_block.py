@@ -26,7 +26,7 @@ from jaxtyping import Bool, Float
 from jaxphoto.adjustment import Adjustment
 from jaxphoto.block import Block, Frame, Start
 from jaxphoto.errors import DatumError, InputError, counted, few
-from jaxphoto.georeferencing.map_frame import MapFrame, check_heights
+from jaxphoto.georeferencing.map_frame import MapFrame, check_area, check_heights
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.marks import (
     Marked,
@@ -34,6 +34,7 @@ from jaxphoto.procedures.control.marks import (
     intersected,
     into_block,
     marked,
+    turned_marks,
     with_gnss_bias,
     without_names,
 )
@@ -108,6 +109,39 @@ def onto_control(
 def on_a_line(there: Float[np.ndarray, "points 3"], here: Float[np.ndarray, "points 3"]) -> bool:
     """Return True if all points are collinear, which leaves the rotation about their line undetermined."""
     return next(_of_threes(there, here), None) is None
+
+
+# Minimum number of points for an affine transformation, maximum ratio of its misfit to that of a similarity, maximum
+# relative difference of axes with the same unit.
+_AFFINE_POINTS, _FITS_BETTER, _SAME_UNIT = 6, 0.1, 0.02
+
+
+def check_units(there, here, file: str) -> None:
+    """Raise InputError if the control fits with one axis in another unit: an affine transformation fits, no similarity.
+
+    A = D s R of the least-squares transformation has A A' = s^2 D^2 with the factors D of the axes.
+    """
+    similarity = similarity_between(there, here)
+    if len(here) < _AFFINE_POINTS or similarity is None:
+        return
+    columns = np.column_stack([there - there.mean(axis=0), np.ones(len(there))])
+    solution, _, rank, _ = np.linalg.lstsq(columns, here, rcond=1e-3)
+    freedom = 3 * len(here) - 12
+    misfit = np.sqrt(np.sum((here - columns @ solution) ** 2) / freedom)
+    if rank < 4 or misfit > _FITS_BETTER * np.sqrt(np.mean(_off(similarity, there, here) ** 2)):
+        return
+    squares = solution[:3].T @ solution[:3]
+    size = np.sqrt(np.diagonal(squares))
+    oblique = squares / np.outer(size, size) - np.eye(3)
+    for axis, name in enumerate("XYZ"):
+        others = np.delete(size, axis)
+        factor = float(others.mean() / size[axis])
+        same = max(np.abs(oblique).max(), np.ptp(others) / others.mean()) < _SAME_UNIT
+        if same and abs(factor - 1) > _SAME_UNIT:
+            raise InputError(
+                f"{file}: the control points fit the photographs if {name} is multiplied by {factor:.4g}: correct its "
+                "unit (1 ft is 0.3048 m)"
+            )
 
 
 def _off(similarity: Similarity, there, here) -> Float[np.ndarray, "points"]:
@@ -195,6 +229,8 @@ def in_frame(
         return InFrame(dataclasses.replace(block.frame, kind="local"), filled(points), False)
     code = new_code(points, system) if code is None else code
     there = places(points, system, code)
+    if system.code is not None:
+        _check_area(points, system, system.code, there)
     middle = np.median(there, axis=0)
     origin = (round(float(middle[0]), 4), round(float(middle[1]), 4), 0.0)
     if vertical is None and code == system.code:
@@ -204,6 +240,17 @@ def in_frame(
     return InFrame(
         Frame("epsg", code, vertical, origin=origin), MapFrame(code, vertical, origin).local_from_place(there), False
     )
+
+
+def _check_area(points: SurveyedPoints, system: ControlSystem, code: int, there: Float[np.ndarray, "points 3"]) -> None:
+    """Raise InputError for points outside the area of their system, with the cure if exchanging coordinates helps."""
+    exchanged = points._replace(coordinates=points.coordinates[:, [1, 0, 2]])
+    try:
+        check_area(code, places(exchanged, system, code), points.file, exchanged.coordinates, "")
+        cure = "with X and Y exchanged they are inside: exchange the two columns"
+    except InputError:
+        cure = "correct their unit or the system"
+    check_area(code, there, points.file, points.coordinates, cure)
 
 
 def stated_system(points: SurveyedPoints, words: str | None) -> ControlSystem:
@@ -356,6 +403,11 @@ def control_block(
         first = f" ({few(list(dict.fromkeys(control.marks.image)))})" if control.marks.image else ""
         raise InputError(f"{points.file}: no mark{first} is in a photograph of the block ({few(block.images)})")
     met = intersected(block, block.start.unknowns, rows, ids)
+    if (turned := turned_marks(block, block.start.unknowns, rows, met.good)) is not None:
+        raise InputError(
+            f"{points.file}: the marks contradict one another, but agree if {turned}. Columns and rows count from the "
+            "upper left corner of the stored picture, whatever its EXIF orientation: convert the marks"
+        )
     if (factor := factor_of_marks(block, block.start.unknowns, rows, met.good)) is not None:
         sensor = block.sensors[block.image_camera[rows.image[0]]]
         raise InputError(
@@ -445,6 +497,7 @@ def _placed(block: Block, frame: InFrame, met, covariance, sigma, points: Survey
         stays = f"the block {'remains in the frame of its positions' if by_positions else 'is not transformed'}"
         messages = [f"{counted(len(known), 'control point')} in two photographs or more{how}: {stays}"]
         return block, met, agree, messages
+    check_units(met[known], frame.xyz[known], points.file)
     spread = np.sqrt(np.trace(covariance[known], axis1=1, axis2=2))
     surveyed = np.linalg.norm(sigma[known], axis=1)
     if not frame.at_place:

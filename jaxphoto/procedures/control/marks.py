@@ -8,7 +8,7 @@ adjustment.
 import dataclasses
 import ntpath
 import re
-from collections.abc import Collection, Sequence
+from collections.abc import Callable, Collection, Sequence
 from itertools import combinations
 from typing import NamedTuple
 
@@ -173,28 +173,52 @@ def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, 
 _FACTORS, _AGREE, _DISAGREE = np.geomspace(0.1, 10.0, 461), 0.9, 0.5
 
 
+TURNED: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
+    "columns and rows are exchanged": lambda p, size: p[:, ::-1],
+    "rows count from the bottom": lambda p, size: np.stack([p[:, 0], size[:, 1] - p[:, 1]], axis=1),
+    "columns count from the right": lambda p, size: np.stack([size[:, 0] - p[:, 0], p[:, 1]], axis=1),
+    "the pictures are turned by 180 degrees": lambda p, size: size - p,
+    "the pictures are turned clockwise by 90 degrees": lambda p, size: np.stack(
+        [p[:, 1], size[:, 1] - p[:, 0]], axis=1
+    ),
+    "the pictures are turned counter-clockwise by 90 degrees": lambda p, size: np.stack(
+        [size[:, 0] - p[:, 1], p[:, 0]], axis=1
+    ),
+}
+"""Conventions of columns and rows, with the conversion to those in the stored picture of a size (px)."""
+
+
+def turned_marks(block: Block, unknowns: Unknowns, rows: Marked, good: Bool[np.ndarray, "rows"]) -> str | None:
+    """Return the convention of columns and rows with which the marks agree, if most contradict one another.
+
+    `good`: marks that agree as given.
+    """
+    contradicting = _Contradicting.of(block, unknowns, rows, good)
+    if contradicting is None:
+        return None
+    agree = {words: contradicting.agreement(turned) for words, turned in TURNED.items()}
+    best = max(agree, key=lambda words: agree[words])
+    return best if agree[best] >= _AGREE else None
+
+
 def factor_of_marks(block: Block, unknowns: Unknowns, rows: Marked, good: Bool[np.ndarray, "rows"]) -> float | None:
     """Return the factor of the pixel coordinates with which the marks agree, if most contradict one another.
 
     Marks of resized pictures need one factor, the ratio of the sizes. `good`: marks that agree as given.
     """
-    several = np.bincount(rows.point)[rows.point] > 1
-    if several.sum() < 4 or good[several].mean() > _DISAGREE:
+    contradicting = _Contradicting.of(block, unknowns, rows, good)
+    if contradicting is None:
         return None
-    rows = rows.take(several)
-    origins = np.asarray(unknowns.exterior.position, float)[rows.image]
+    point, n = contradicting.rows.point, int(contradicting.rows.point.max()) + 1
+    origins = np.asarray(unknowns.exterior.position, float)[contradicting.rows.image]
     matrices = np.asarray(unknowns.exterior.camera_from_object, float)
-    sensors = [block.sensors[block.image_camera[k]] for k in rows.image]
-    half = np.array([(s.width_px, s.height_px) for s in sensors]) / 2
-    pixel = np.array([(s.pixel_mm, -s.pixel_mm) for s in sensors])
-    column_row = rows.xy_mm / pixel + half
-    point, n = rows.point, int(rows.point.max()) + 1
 
-    def scaled(factor: float) -> Marked:
-        return rows._replace(xy_mm=(factor * column_row - half) * pixel)
+    def scaled(factor: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+        return lambda column_row, size: factor * column_row
 
     def misclosure(factor: float) -> float:
-        directions = turn_to_object(matrices, rows.image, rays_of(block, unknowns, scaled(factor)))
+        rows = contradicting.converted(scaled(factor))
+        directions = turn_to_object(matrices, rows.image, rays_of(block, unknowns, rows))
         places, _ = intersect_points(origins, directions, point, n, min_angle=_PARALLEL)
         towards = places[point] - origins
         across = np.linalg.norm(np.cross(directions, towards), axis=1) / np.linalg.norm(towards, axis=1)
@@ -203,8 +227,40 @@ def factor_of_marks(block: Block, unknowns: Unknowns, rows: Marked, good: Bool[n
     factor = float(min(_FACTORS, key=misclosure))
     step = _FACTORS[1] / _FACTORS[0]
     factor = float(min(np.geomspace(factor / step, factor * step, 41), key=misclosure))
-    ids = tuple(map(str, range(n)))
-    return factor if intersected(block, unknowns, scaled(factor), ids).good.mean() >= _AGREE else None
+    return factor if contradicting.agreement(scaled(factor)) >= _AGREE else None
+
+
+class _Contradicting(NamedTuple):
+    """Marks of points in several images, most of which contradict one another."""
+
+    block: Block
+    unknowns: Unknowns
+    rows: Marked
+    size: Float[np.ndarray, "rows 2"]
+    """Width and height of the pictures (px)."""
+    pixel_mm: Float[np.ndarray, "rows 1"]
+
+    @staticmethod
+    def of(block: Block, unknowns: Unknowns, rows: Marked, good: Bool[np.ndarray, "rows"]) -> "_Contradicting | None":
+        """Select the marks; None if half of them agree as given, or for fewer than four."""
+        several = np.bincount(rows.point)[rows.point] > 1
+        if several.sum() < 4 or good[several].mean() > _DISAGREE:
+            return None
+        rows = rows.take(several)
+        sensors = [block.sensors[block.image_camera[k]] for k in rows.image]
+        size = np.array([(s.width_px, s.height_px) for s in sensors], float)
+        return _Contradicting(block, unknowns, rows, size, np.array([[s.pixel_mm] for s in sensors]))
+
+    def converted(self, change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> Marked:
+        """Return the marks with other columns and rows."""
+        down = self.pixel_mm * (1, -1)
+        column_row = self.rows.xy_mm / down + self.size / 2
+        return self.rows._replace(xy_mm=(change(column_row, self.size) - self.size / 2) * down)
+
+    def agreement(self, change: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> float:
+        """Return the fraction of marks that agree with other columns and rows."""
+        ids = tuple(map(str, range(int(self.rows.point.max()) + 1)))
+        return float(intersected(self.block, self.unknowns, self.converted(change), ids).good.mean())
 
 
 def _passing(origins, directions, limit) -> Bool[np.ndarray, "rays"]:

@@ -41,6 +41,8 @@ _FAR = 0.1
 _BORNE_OUT = 0.7
 # Relative change of a principal distance above which it is unusual for a laboratory value.
 _UNUSUAL = 0.02
+# Sigma naught above which wrong weights are not a sufficient explanation (docs/trust.md).
+_MISFIT = 3.0
 
 
 class Round(NamedTuple):
@@ -186,6 +188,7 @@ def iterate_to_convergence(
         if converged or len(rounds) >= max_rounds:
             _check_used(surface, used)
             _warn_of_scale(first, new)
+            _warn_of_misfit(new)
             return Observed(at_first, adjusted, cov, surface, used, tuple(rounds), converged)
         if len(rounds) >= _JUDGED:
             # In later iterations rejections are final, to avoid alternation.
@@ -237,6 +240,17 @@ def _warn_of_scale(first: Adjustment, adjusted: Adjustment) -> None:
                 UserWarning,
                 stacklevel=4,
             )
+
+
+def _warn_of_misfit(adjusted: Adjustment) -> None:
+    """Warn if the observations do not agree with the cloud."""
+    if (sigma0 := float(adjusted.sigma0)) > _MISFIT:
+        warnings.warn(
+            f"sigma naught is {sigma0:.3g}: the cloud contradicts the other observations; check its system, the order "
+            "of its axes and its vertical datum",
+            UserWarning,
+            stacklevel=4,
+        )
 
 
 def _keep_similar(old: SurfaceAtPoints, new: SurfaceAtPoints, adjusted: Adjustment) -> SurfaceAtPoints:
