@@ -22,7 +22,7 @@ from jaxphoto.procedures.georeference_photographs import (
     georeference_photographs,
     with_fixed_datum,
 )
-from jaxphoto.procedures.known_lens import Contradiction, KnownLens, contradiction, with_known_lens
+from jaxphoto.procedures.known_lens import KnownLens, RejectedPrior, contradicted_prior, with_known_lens
 from jaxphoto.procedures.orientation import Oriented, orient
 from jaxphoto.procedures.orientation.orient_photographs import CAMERA, Report
 from jaxphoto.procedures.rolling_shutter import NEIGHBOUR_M, Moment, with_rolling_shutter
@@ -115,7 +115,7 @@ class FlightPart(NamedTuple):
     """Reason for unused control."""
     lens: tuple[str, ...] = ()
     """Messages about the prior information about the lens, if used."""
-    lens_rejected: tuple[Contradiction, ...] = ()
+    lens_rejected: tuple[RejectedPrior, ...] = ()
     """Priors of the lens that contradict the images, and are not used."""
     why_no_shutter: str = ""
     """Reason why a requested rolling shutter was not estimated."""
@@ -176,7 +176,7 @@ def _calibrated(
     )
     part = _adjusted(oriented, matched, prior, (), report)
     # Focal lengths in EXIF may be those of another format (cropped pictures, video).
-    while part.noise is not None and (found := contradiction(part.adjusted, part.noise, CAMERA)):
+    while part.noise is not None and (found := contradicted_prior(part.adjusted, part.noise, CAMERA)):
         part = _adjusted(oriented, matched, prior, (*part.lens_rejected, found), report)
     return part
 
@@ -185,7 +185,7 @@ def _adjusted(
     oriented: Oriented,
     matched: MatchedPart,
     prior: KnownOfFlight,
-    rejected: tuple[Contradiction, ...],
+    rejected: tuple[RejectedPrior, ...],
     report: Report,
 ) -> FlightPart:
     """Georeference and adjust an oriented part, without the `rejected` priors of the lens."""

@@ -65,7 +65,7 @@ def with_known_lens(block: Block, camera: str, lens: KnownLens, without: Collect
     return dataclasses.replace(block, priors=dataclasses.replace(block.priors, interior=interior))
 
 
-class Contradiction(NamedTuple):
+class RejectedPrior(NamedTuple):
     """Prior value of a parameter that contradicts all other observations."""
 
     parameter: str
@@ -81,7 +81,7 @@ class Contradiction(NamedTuple):
         return f"{self.parameter} {self.value:.5g} +- {self.sigma:.2g} without it, {given} by it"
 
 
-def contradiction(adjusted: Adjustment, noise: CorrelatedNoise, camera: str) -> Contradiction | None:
+def contradicted_prior(adjusted: Adjustment, noise: CorrelatedNoise, camera: str) -> RejectedPrior | None:
     """Return the prior of the camera that most contradicts the other observations, if significantly.
 
     With estimate x, variances q (independent errors) and s^2 (`noise`), and a prior p of variance p2, the estimate
@@ -91,7 +91,7 @@ def contradiction(adjusted: Adjustment, noise: CorrelatedNoise, camera: str) -> 
 
     Its difference from p, over the standard deviation of the difference, is tested at the level of blunders.
     """
-    found: list[tuple[float, Contradiction]] = []
+    found: list[tuple[float, RejectedPrior]] = []
     interior, priors = adjusted.unknowns.interior[camera], adjusted.block.priors.interior[camera]
     for name in parameter_names(priors):
         prior, label = get_parameter(priors, name), f"interior[{camera}].{name}"
@@ -103,6 +103,6 @@ def contradiction(adjusted: Adjustment, noise: CorrelatedNoise, camera: str) -> 
         if q < known:
             sigma = math.sqrt(max(s2 - q**2 / known, 0.0)) * known / (known - q)
             value = x + (x - p) * q / (known - q)
-            found.append((abs(value - p) / math.hypot(sigma, prior.sigma), Contradiction(name, prior, value, sigma)))
+            found.append((abs(value - p) / math.hypot(sigma, prior.sigma), RejectedPrior(name, prior, value, sigma)))
     largest = max(found, key=lambda one: one[0], default=None)
     return largest[1] if largest and largest[0] > critical_w(len(found), adjusted.redundancy) else None

@@ -240,6 +240,9 @@ class _Effect(NamedTuple):
     numbers: dict[str, Any]
     terms: tuple[_Term, ...]
     """Terms that explain most of the effect."""
+    explained: float
+    """Reduction of v'Pv by the effect, with `freedom` unknowns."""
+    freedom: int
 
     def finding(self, severity: Severity) -> Finding:
         """Return the effect as a finding."""
@@ -284,7 +287,8 @@ def _systematic(tables: Tables, fits: bool, sizes: statistics.ErrorSizes | None 
         numbers = {"p": p_words(t.p_value), "detail": detail}
         severity: Severity = "error" if spoilt else "warning" if matters else "note"
         terms = tuple((t.pattern, h.term) for h in likely)
-        yield _Effect(chance, severity, subject, factor * t.size, _VISIBLE * factor * t.sigma, numbers, terms)
+        limit = _VISIBLE * factor * t.sigma
+        yield _Effect(chance, severity, subject, factor * t.size, limit, numbers, terms, t.explained, t.freedom)
 
 
 def _terms(
@@ -519,11 +523,17 @@ def _estimated_weights(components: statistics.VarianceComponents, stated: Tables
 
 
 def _other_explanations(stated: Tables, estimated: Tables) -> Iterator[Finding]:
-    """Report effects and outliers that are significant with the stated, but not with the estimated weights."""
-    effects = [{e.subject for e in _systematic(t, True)} for t in (stated, estimated)]
-    outliers = [{(s.group, s.row) for s in t.blunders.suspects} for t in (stated, estimated)]
-    causes = sorted(effects[0] - effects[1])
-    if n := len(outliers[0] - outliers[1]):
-        causes.append(counted(n, "outlier"))
+    """Report effects and outliers that are significant with the stated, but not with the estimated weights.
+
+    Each with the part of v'Pv that it explains alone, the largest first.
+    """
+    remaining = {e.subject for e in _systematic(estimated, True)}
+    kept = {(s.group, s.row) for s in estimated.blunders.suspects}
+    causes = [(e.explained, e.freedom, e.subject) for e in _systematic(stated, True) if e.subject not in remaining]
+    variance = float(stated.adjusted.sigma0) ** 2
+    gone = (s for s in stated.blunders.suspects if (s.group, s.row) not in kept)
+    causes += [(s.w**2 * variance, 1, f"an outlier in {s.words}") for s in gone]
     if causes:
-        yield Finding("other_explanations", "note", few(causes), len(causes))
+        whole = float(stated.adjusted.sum_of_squares)
+        words = [f"{what} ({part:.3g}, {counted(n, 'unknown')})" for part, n, what in sorted(causes, reverse=True)]
+        yield Finding("other_explanations", "note", few(words), len(causes), numbers={"whole": whole})

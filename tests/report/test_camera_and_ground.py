@@ -12,7 +12,7 @@ from jaxphoto.adjustment.iteration_log import step_lines
 from jaxphoto.camera import Brown, InteriorOrientation, set_parameter
 from jaxphoto.camera.lens_prior import lens_prior, prior_sigmas
 from jaxphoto.observations import KnownParameters
-from jaxphoto.procedures.known_lens import KnownLens, contradiction, with_known_lens
+from jaxphoto.procedures.known_lens import KnownLens, contradicted_prior, with_known_lens
 from jaxphoto.report.results import convergence_words
 from jaxphoto.report.tables import convergence_table, side_by_side
 from jaxphoto.report.verdict import lens_findings, shutter_findings
@@ -49,14 +49,14 @@ def test_a_focal_length_of_another_format_is_not_used():
     found = adjusted("cross")
     block = with_known_lens(found.block, "one", LENS)
     true = jaxphoto.adjust(block)
-    assert contradiction(true, correlated_noise(true), "one") is None
+    assert contradicted_prior(true, correlated_noise(true), "one") is None
     c, sigma = float(LENS.nominal.c), float(block.priors.interior["one"].c.sigma)
     free = set_parameter(block.priors.interior["one"], "c_mm", FREE)
     wrong = set_parameter(free, "c_mm", Weighted(c + 10 * sigma, sigma))
     priors = {name: dataclasses.replace(block.priors, interior={"one": p}) for name, p in (("f", free), ("w", wrong))}
     right = jaxphoto.adjust(dataclasses.replace(block, priors=priors["f"]))
     pulled = jaxphoto.adjust(dataclasses.replace(block, priors=priors["w"]))
-    one = contradiction(pulled, correlated_noise(pulled), "one")
+    one = contradicted_prior(pulled, correlated_noise(pulled), "one")
     free_sigma = float(jaxphoto.covariance(right).of_interior("one", ["c_mm"])[0, 0]) ** 0.5
     assert one is not None and one.parameter == "c_mm"
     assert one.value == pytest.approx(float(right.unknowns.interior["one"].c), abs=0.3 * free_sigma)
