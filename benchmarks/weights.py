@@ -55,6 +55,14 @@ RTK["flight"]["strips"] = [
 ]
 del RTK["targets"]
 RTK["sigmas"]["station_m"] = RTK["noise"]["station_m"] = [0.02, 0.02, 0.04]
+LIDAR = copy.deepcopy(FLAT) | {"title": "block with lidar heights", "targets": [{"count": 60, "role": "vertical"}]}
+LIDAR["sigmas"] |= {"station_m": [0.05, 0.05, 0.1], "control_m": 0.1}
+LIDAR["noise"]["station_m"] = [0.05, 0.05, 0.1]
+STRIPS = copy.deepcopy(RTK) | {"title": "stations with a shift of each strip", "strips": {
+    "default": {
+        "shift_m": [0.0, 0.0, 0.0], "shift": "free", "truth": {"shift_sigma_m": [0.3, 0.3, 0.3]},
+    },
+}, "targets": [{"count": 6, "role": "control"}]}  # fmt: skip
 
 
 def _changed(recipe: dict[str, Any], **noise: Any) -> dict[str, Any]:
@@ -67,6 +75,9 @@ RECIPES = {
     "image_1px": FLAT,
     "as_stated": _changed(FLAT, image_mm=0.0024, target_mm=0.0024),
     "control_3x": _changed(FLAT, control_m=0.15),
+    "lidar": LIDAR,
+    "lidar_3x": _changed(LIDAR, control_m=0.3),
+    "strips": STRIPS,
     "rtk": RTK,
     "rtk_control": RTK | {"targets": [{"count": 6, "role": "control"}]},
     "rtk_3x": _changed(RTK, station_m=[0.06, 0.06, 0.12]),
