@@ -3,8 +3,8 @@
 python benchmarks/error_sizes.py --flights 500
 
 Errors of 1 to 1000 standard deviations (log-uniform) are added to the example block, with new noise each time: to one
-observation, to all stations, or to the stations of one strip. Where a finding names the error with its size and sigma,
-the interval of 95 % is held against the truth.
+observation, to all stations or control points (another datum), or to the stations of one strip. Where a finding names
+the error with its size and sigma, the interval of 95 % is held against the truth.
 """
 
 import argparse
@@ -20,7 +20,7 @@ from jaxphoto import Block, Tables, Unknowns, adjust
 from jaxphoto.report import verdict_of
 from jaxphoto.simulation import remeasure
 
-KINDS = ("control point", "station", "image point", "all stations", "strip")
+KINDS = ("control point", "station", "image point", "all stations", "all control points", "strip")
 _NUMBER = r"([+-][\d.e+-]+) \+- ([\d.e+-]+)"
 
 
@@ -34,7 +34,7 @@ def disturbed(block: Block, kind: str, rng: np.random.Generator) -> tuple[Block,
         xy[row, axis] += size
         label = rows.words_of(np.array([axis]), np.array([row]), block.images, block.points)[0]
         return block.with_observations({"image_points": eqx.tree_at(lambda r: r.xy, rows, xy)}), f"{label}: error", size
-    name = "control_points" if kind == "control point" else "stations"
+    name = "control_points" if "control" in kind else "stations"
     rows = block.named_observations[name]
     axis = rng.integers(3)
     chosen = np.asarray(rows.axis) == axis

@@ -12,7 +12,7 @@ from jaxphoto.errors import BlockError, GroupsError
 from jaxphoto.initial.matches import PairMatches
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.procedures.orientation import orient
-from jaxphoto.procedures.orientation.orient_photographs import shared_covariance
+from jaxphoto.statistics import covariance
 from jaxphoto.unknowns import FIXED, Weighted
 from tests.procedures.orientable import (
     PIXEL,
@@ -57,8 +57,7 @@ def parameters(oriented):
     """Estimates and a posteriori sigmas of the interior orientation that is free."""
     adjusted = adjust(oriented.block)
     labels = [label.split("].")[1] for label in adjusted.structure.labels]
-    sigmas = np.sqrt(np.diagonal(shared_covariance(adjusted))) * float(adjusted.sigma0)
-    sigmas = dict(zip(labels, sigmas, strict=True))
+    sigmas = dict(zip(labels, np.asarray(covariance(adjusted).shared_sigma), strict=True))
     interior = oriented.block.start.unknowns.interior["camera"]
     return {n: (float(get_parameter(interior, n)), sigmas[n]) for n in oriented.report.estimated}
 
