@@ -218,6 +218,8 @@ def monte_carlo(
     keep: Annotated[
         list[str] | None, Option("--with", help="Also store exterior, or points with check points (repeatable).")
     ] = None,
+    workers: opt.Workers = None,
+    scheduler: opt.Scheduler = None,
 ) -> None:
     """Re-adjust a block with random errors; write draws, their statistics and a report."""
     import numpy as np
@@ -228,8 +230,12 @@ def monte_carlo(
     from jaxphoto.procedures.adjust import adjust
     from jaxphoto.report.draws import print_draws, write_draws_page
     from jaxphoto.sensitivity import Readjustment, bias, check_draws, noise
+    from jaxphoto.sensitivity.monte_carlo import MAX_DEVICES
+    from jaxphoto.workers import connected
 
     check_draws(draws)
+    if workers is not None and scheduler is not None:
+        raise typer.BadParameter("--workers starts its own scheduler: omit it or --scheduler.")
     if invalid := set(keep or ()) - {"exterior", "points"}:
         raise typer.BadParameter(f"--with {invalid.pop()}: choose from exterior, points.")
     if seed >= 2**63:
@@ -246,10 +252,13 @@ def monte_carlo(
         progress.update("preparing the draws")
         drawn_sigmas = np.broadcast_to(drawn.sigma, (draws, len(drawn.sigma)))
         kept = {name: name in (keep or ()) for name in ("exterior", "points")}
-        run = Readjustment(adjusted, drawn.applied, drawn_sigmas, **kept)
+        # On one device per worker, results do not depend on the numbers of cores.
+        most = MAX_DEVICES if workers is None and scheduler is None else 1
+        run = Readjustment(adjusted, drawn.applied, drawn_sigmas, **kept, devices=most)
         warn_of_contradictions(adjusted, output)
         study = MonteCarlo(read, run, drawn, draws, seed, out)
-        study.draw(lambda done: progress.steps("draws", done, draws))
+        with connected(workers, scheduler) as client:
+            study.draw(lambda done: progress.steps("draws", done, draws), client)
         progress.update(f"writing {out}")
         summary, table = study.write()
         write_draws_page(summary, table, read.sensors, out, record)

@@ -53,6 +53,10 @@ Out = Annotated[Path, Option(help="Output folder; earlier results in it are repl
 BlockOut = Annotated[Path, Option(help="Block folder to write; a block in it is replaced.")]
 MaxSteps = Annotated[int, Option(min=1, help="Maximum number of iterations.")]
 Seed = Annotated[int, Option(min=0, help="Seed of the random numbers.")]
+Workers = Annotated[int | None, Option(min=1, help="Compute with this number of processes (docs/cluster.md).")]
+Scheduler = Annotated[
+    str | None, Option(help="Compute on the workers of the Dask scheduler at this address (docs/cluster.md).")
+]
 
 Alignment = Annotated[
     Literal["zrot", "rot", "spr"], Option("--method", help="Alignment of the ray bundles (docs/stability.md).")

@@ -7,6 +7,7 @@ import time
 from collections.abc import Callable
 from functools import cached_property
 from pathlib import Path
+from typing import Any
 
 import jax
 import numpy as np
@@ -17,7 +18,8 @@ from jaxphoto.io.draws_folder import DrawsFolder, digest_of
 from jaxphoto.io.text_files import read_json
 from jaxphoto.report.draws import draws_table, in_degrees, summary_table
 from jaxphoto.report.page import versions
-from jaxphoto.sensitivity import Bias, Readjustment, join_draws
+from jaxphoto.sensitivity import Bias, Readjustment
+from jaxphoto.workers import in_parts
 from jaxphoto.writing import whole_file
 
 # Maximum size of a part in draws, components and image rows: an interrupted run loses one part (some seconds).
@@ -41,45 +43,48 @@ class MonteCarlo:
         self.keys = jax.jit(jax.vmap(lambda k: drawn.drawn(jax.random.fold_in(jax.random.key(seed), k))))
         widest = len(drawn.names) + len(draws_table(run.first_order(np.zeros((1, len(drawn.names)))), run.adjusted).T)
         rows = len(run.adjusted.structure.image)
-        parts = min(_PART, _PART_NUMBERS // widest, _PART_ROWS // rows) // run.batch_size
+        part = run.part_size(min(_PART, _PART_NUMBERS // widest, _PART_ROWS // rows))
         settings = {
             "block": digest_of(block), "errors": _errors_line(drawn), "sigma": _sigma_line(drawn), "seed": seed,
             # Identify the distribution, which has no name, by its first draws.
             "first_draws": _digest(np.asarray(self.keys(np.arange(4)))),
-            "exterior": run.exterior, "points": run.points, "batch": run.batch_size, "devices": run.devices,
-            "thorough": run.many, "versions": versions(),
+            "exterior": run.exterior, "points": run.points, "devices": run.devices, "thorough": run.many,
+            "versions": versions(),
         }  # fmt: skip
-        self.folder = DrawsFolder(directory, settings, draws, run.batch_size * max(1, parts))
+        self.folder = DrawsFolder(directory, settings, draws, part)
         self.computed, self.seconds = 0, 0.0
 
-    def draw(self, progress: Callable[[int], object] = lambda done: None) -> None:
-        """Draw the missing draws. `progress` is called with the number of draws.
+    def draw(self, progress: Callable[[int], object] = lambda done: None, client: Any = None) -> None:
+        """Draw the missing draws, on the workers of a `dask.distributed.Client` if given.
 
-        Raises InputError if another process draws into the folder.
+        `progress` is called with the number of draws. Raises InputError if another process draws into the folder, and
+        the errors of `in_parts`.
         """
         folder = self.folder
         with folder.alone():
             if not folder.done:
-                each = np.arange(folder.per_part)
-                self.run.warm_up(np.asarray(self.keys(each)))
-                for part in range(folder.next_part, folder.n_parts):
-                    began = time.perf_counter()
-                    self._draw_part(part, part * folder.per_part + each, progress)
-                    self.seconds += time.perf_counter() - began
+                missing = folder.missing_parts()
+                done = folder.draws - sum(map(self._size, missing))
+                began = time.perf_counter()
+                for part, draws in in_parts(self.run, ((k, self._errors(k)) for k in missing), client):
+                    recorded = dict(zip(self.drawn.names, self._errors(part).T, strict=True))
+                    draws = dataclasses.replace(draws, recorded=recorded if self.drawn.recorded else {})
+                    folder.write_part(part, draws_table(draws, self.run.adjusted, part * folder.per_part))
+                    self.computed += self._size(part)
+                    done += self._size(part)
+                    progress(done)
+                self.seconds = time.perf_counter() - began - self.run.seconds["compile"]
                 folder.join()
             folder.tidy()
 
-    def _draw_part(self, part: int, numbers: np.ndarray, progress: Callable[[int], object]) -> None:
-        """Compute the requested draws of `numbers`. Its length is constant, so one program is compiled."""
-        errors, batches, done = np.asarray(self.keys(numbers))[numbers < self.folder.draws], [], int(numbers[0])
-        for batch in self.run.batches(errors):
-            batches.append(batch)
-            done += len(batch.steps)
-            progress(done)
-        recorded = dict(zip(self.drawn.names, errors.T, strict=True)) if self.drawn.recorded else {}
-        draws = dataclasses.replace(join_draws(batches), recorded=recorded)
-        self.folder.write_part(part, draws_table(draws, self.run.adjusted, int(numbers[0])))
-        self.computed += len(errors)
+    def _size(self, part: int) -> int:
+        """Return the number of draws of a part."""
+        return min(self.folder.per_part, self.folder.draws - part * self.folder.per_part)
+
+    def _errors(self, part: int) -> np.ndarray:
+        """Draw the errors of a part. All parts have the same length here, so one program is compiled."""
+        errors = np.asarray(self.keys(part * self.folder.per_part + np.arange(self.folder.per_part)))
+        return errors[: self._size(part)]
 
     def write(self) -> tuple[dict, pd.DataFrame]:
         """Write summary.csv, effects.csv and, last, summary.json; return the summary and its table.

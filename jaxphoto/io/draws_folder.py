@@ -1,6 +1,7 @@
 """Monte Carlo draws on disk: Parquet parts during a run, then one file.
 
-Parts are written atomically. An interrupted run resumes after its last part and yields an identical file.
+Parts are written atomically. Parts may be written in any order. An interrupted run resumes with
+the missing parts and yields an identical file.
 """
 
 import contextlib
@@ -57,15 +58,16 @@ class DrawsFolder:
         """True if all draws are in one file."""
         return (self.directory / DRAWS).is_file()
 
-    @property
-    def next_part(self) -> int:
-        """Index of the first missing part. Raises InputError if a part is damaged."""
-        k = 0
-        while self._part(k).is_file():
-            with _reading(self._part(k)):
-                pq.read_schema(self._part(k))
-            k += 1
-        return k
+    def missing_parts(self) -> list[int]:
+        """Return the indices of missing parts. Raises InputError if a part is damaged."""
+        missing = []
+        for k in range(self.n_parts):
+            if self._part(k).is_file():
+                with _reading(self._part(k)):
+                    pq.read_schema(self._part(k))
+            else:
+                missing.append(k)
+        return missing
 
     @property
     def n_parts(self) -> int:
@@ -125,7 +127,10 @@ class DrawsFolder:
     @property
     def _files(self) -> list[Path]:
         """File of all draws, or the parts written so far."""
-        return [self.directory / DRAWS] if self.done else [self._part(k) for k in range(self.next_part)]
+        if self.done:
+            return [self.directory / DRAWS]
+        missing = set(self.missing_parts())
+        return [self._part(k) for k in range(self.n_parts) if k not in missing]
 
     def _part(self, k: int) -> Path:
         return self.directory / _PARTS / f"part-{k:06d}.parquet"

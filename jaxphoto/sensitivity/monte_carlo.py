@@ -32,11 +32,14 @@ from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.perturbation import Perturbation, Recorded, in_order_of
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.tracing import outside_transformations
+from jaxphoto.workers import in_parts
 
 # Minimum number of draws for optimised compilation.
 _MANY = 500
-# Maximum number of devices.
-_MAX_DEVICES = 1024
+MAX_DEVICES = 1024
+"""Maximum number of devices."""
+# Maximum number of draws per part.
+_PART = 1000
 
 
 @pretty_repr
@@ -68,13 +71,15 @@ def monte_carlo(
     *,
     exterior: bool = False,
     points: bool = False,
+    client: Any = None,
 ) -> Draws:
     """Re-adjust the block of `adjusted` `draws` times, each with values drawn by `perturb`.
 
     `perturb(key, block)` returns the block with other values, alone or with a dict of scalars to record; see
     `jaxphoto.bias` for common perturbations. It is mapped over keys by `jax.vmap`: the key of draw k is
     `jax.random.fold_in(jax.random.key(seed), k)`. The initial values of its block are the adjusted unknowns. Ids,
-    indices and shapes must not change.
+    indices and shapes must not change. `client`: a `dask.distributed.Client`, whose workers compute the draws
+    (docs/cluster.md), with the same results.
 
     Raises InputError for less than one draw.
     """
@@ -83,7 +88,8 @@ def monte_carlo(
         raise InputError(
             f"{perturb!r} is no function of a key and a block; give one, such as jaxphoto.bias(block, ...)"
         )
-    return readjust(adjusted, DrawnChange(perturb, seed), np.arange(draws), exterior=exterior, points=points)
+    change = DrawnChange(perturb, seed)
+    return readjust(adjusted, change, np.arange(draws), exterior=exterior, points=points, client=client)
 
 
 @outside_transformations
@@ -94,6 +100,7 @@ def readjust(
     *,
     exterior: bool = False,
     points: bool = False,
+    client: Any = None,
 ) -> Draws:
     """Re-adjust the block of `adjusted` for each entry along the first axis of `entries`, a tree of arrays.
 
@@ -102,8 +109,12 @@ def readjust(
     require(adjusted, Adjustment, "give the result of jaxphoto.adjust(block)")
     if not callable(change):
         raise InputError(f"{change!r} is no function of a block; give one, such as jaxphoto.bias(block, ...)")
-    run = Readjustment(adjusted, change, entries, exterior=exterior, points=points)
-    return join_draws(list(run.batches(entries)))
+    devices = 1 if client else MAX_DEVICES
+    run = Readjustment(adjusted, change, entries, exterior=exterior, points=points, devices=devices)
+    size, whole = run.part_size(_PART), jax.tree.map(to_numpy, entries)
+    parts = [jax.tree.map(lambda v, k=k: v[k : k + size], whole) for k in range(0, _count(whole), size)]
+    found = dict(in_parts(run, enumerate(parts), client))
+    return join_draws([found[k] for k in range(len(parts))])
 
 
 def check_draws(draws: int) -> None:
@@ -124,13 +135,21 @@ class DrawnChange(eqx.Module):
 
 
 class Readjustment:
-    """Re-adjustment of a block with other values, compiled once. `seconds`: time of compilation.
+    """Re-adjustment of a block with other values, compiled once; a study of `in_parts`. `seconds`: time of compilation.
 
-    `example` has the structure and length of the entries of `batches`; compilation is optimised for many draws.
+    `example` has the structure and length of the entries of `batches`; compilation is optimised for many draws. Results
+    on one and on several `devices`, at most the number given, differ by rounding.
     """
 
     def __init__(
-        self, adjusted: Adjustment, change: Callable, example: Any, *, exterior: bool = False, points: bool = False
+        self,
+        adjusted: Adjustment,
+        change: Callable,
+        example: Any,
+        *,
+        exterior: bool = False,
+        points: bool = False,
+        devices: int = MAX_DEVICES,
     ):
         if not bool(adjusted.converged):
             raise InputError(f"draws need a converged adjustment, but the block is {adjusted.outcome.value}")
@@ -141,15 +160,16 @@ class Readjustment:
         )
         self.change, self.exterior, self.points = change, exterior, points
         self.seconds = {"compile": 0.0}
-        self.many = _count(example) >= _MANY
+        self.count, self.first = _count(example), jax.tree.map(lambda v: to_numpy(v)[:1], example)
+        self.many = self.count >= _MANY
         start = Start(
             adjusted.unknowns, *(np.ones(len(n), bool) for n in (adjusted.block.images, adjusted.block.points))
         )
         self.nominal = dataclasses.replace(adjusted.block, start=start, priors=adjusted.priors)
         # With several processes, each one draws on its first device.
-        self.devices = usable(_MAX_DEVICES) if jax.process_count() == 1 else 1
+        self.devices = usable(devices) if jax.process_count() == 1 else 1
         self.common = common_of(self.adjusted)
-        self.names = self._varying_fields(jax.tree.map(lambda v: v[:1], example))
+        self.names = self._varying_fields(self.first)
         self._values = jax.jit(jax.vmap(self._varying_values, out_axes=(-1, 0)))
 
     @property
@@ -157,12 +177,26 @@ class Readjustment:
         """Number of draws per batch."""
         return self.devices * batch_size(self.adjusted.structure)
 
-    def warm_up(self, entries: Any) -> None:
+    def part_size(self, draws: int) -> int:
+        """Return the largest number of draws up to `draws` that fills batches; at least one batch."""
+        return self.batch_size * max(1, draws // self.batch_size)
+
+    def prepare(self) -> "Readjustment":
         """Compile the programs of `batches`."""
         began = time.perf_counter()
-        first = jax.tree.map(lambda v: to_numpy(v)[:1], entries)
-        self._fetch(*self._start(first, first_only=False), 1)
+        self._fetch(*self._start(self.first, first_only=False), 1)
         self.seconds["compile"] = time.perf_counter() - began
+        return self
+
+    def compute(self, prepared: "Readjustment", part: Any) -> Draws:
+        """Return the draws of the entries of a part."""
+        return join_draws(list(prepared.batches(part)))
+
+    def __reduce__(self):
+        # Equinox' bound methods cannot be pickled.
+        owner, method = getattr(self.change, "__self__", self.change), getattr(self.change, "__name__", "__call__")
+        arguments = self.adjusted, owner, method, self.first, self.count, self.exterior, self.points, self.devices
+        return _readjustment, arguments
 
     def batches(self, entries: Any) -> Iterator[Draws]:
         """Yield the re-adjustments of `entries` in batches."""
@@ -269,6 +303,13 @@ class Readjustment:
         if not varying:
             raise InputError("the perturbation changes no value of the block: return the block with other values")
         return tuple(varying)
+
+
+def _readjustment(adjusted, owner, method, first, count, exterior, points, devices) -> Readjustment:
+    """Return a `Readjustment` in another process."""
+    change = owner if method == "__call__" or not hasattr(owner, method) else getattr(owner, method)
+    example = jax.tree.map(lambda v: np.broadcast_to(v, (count, *v.shape[1:])), first)
+    return Readjustment(adjusted, change, example, exterior=exterior, points=points, devices=devices)
 
 
 def common_of(adjusted: Adjustment, batch: int | None = None) -> Common:

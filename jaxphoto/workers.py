@@ -1,0 +1,168 @@
+"""Studies in parts: in this process, or on the workers of a Dask scheduler (extra `cluster`).
+
+A study is data and two methods: `prepare` compiles its programs, once per worker, and `compute` returns the result of a
+part as arrays. It travels once to the scheduler, which passes it on; results return to this process, which writes all
+files, so the machines need no common file system. Results do not depend on the number of workers or their order.
+"""
+
+import io
+import os
+import pickle
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+from itertools import islice
+from typing import TYPE_CHECKING, Any, Protocol
+from urllib.parse import urlsplit
+from uuid import uuid4
+
+import jax
+
+from jaxphoto.errors import InputError
+from jaxphoto.optional import extra
+
+if TYPE_CHECKING:
+    from distributed import Client
+
+# Number of parts per worker that are computed or wait for it: a worker never waits for the next part.
+_AHEAD = 2
+# Number of workers that may die while they compute a part. Then the part itself is too large, or wrong.
+_DEATHS = 10
+# Runs in each worker before it imports JAX: divide the cores among the workers of this machine.
+_PIN = """
+import os
+
+def dask_setup(worker):
+    if hasattr(os, "sched_setaffinity"):
+        cores, workers = sorted(os.sched_getaffinity(0)), {workers}
+        own = int(worker.name) % min(workers, len(cores))
+        os.sched_setaffinity(0, cores[own :: workers] or [cores[own]])
+"""
+# One thread per core: pools of BLAS would fight XLA's own (docs/solver.md).
+_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"}
+
+
+class Study(Protocol):
+    """Computation in independent parts; it is pickled for other processes."""
+
+    def prepare(self) -> Any:
+        """Compile what all parts need."""
+
+    def compute(self, prepared: Any, part: Any) -> Any:
+        """Return the result of a part, as NumPy arrays."""
+
+
+def in_parts(
+    study: Study, parts: Iterable[tuple[int, Any]], client: "Client | None" = None
+) -> Iterator[tuple[int, Any]]:
+    """Yield number and result of each numbered part as it is computed.
+
+    Without a `client` of a Dask scheduler, the parts are computed here, in order. Raises InputError if the scheduler
+    or its workers are lost.
+    """
+    if client is None:
+        prepared = study.prepare()
+        for number, part in parts:
+            yield number, study.compute(prepared, part)
+        return
+    with extra():
+        from distributed import KilledWorker, as_completed
+        from distributed.comm import CommClosedError
+    waiting, name, numbers = iter(parts), uuid4().hex, dict[Any, int]()
+    try:
+        # As the result of a task, unlike scattered data, the study survives the death of the worker that holds it.
+        sent = client.submit(bytes, _pickled(study), key=f"study-{name}", pure=False)
+
+        def submit(count: int) -> list[Any]:
+            new = {client.submit(_compute, name, sent, part, pure=False): k for k, part in islice(waiting, count)}
+            numbers.update(new)
+            return list(new)
+
+        running = as_completed(submit(_AHEAD * max(1, len(client.scheduler_info()["workers"]))))
+        for future in running:
+            result = future.result()
+            for following in submit(1):
+                running.add(following)
+            yield numbers.pop(future), result
+    except KilledWorker:
+        raise InputError(
+            f"{_DEATHS} workers died while they computed one part, perhaps for lack of memory: use fewer workers per "
+            "machine. Finished parts are kept; repeat the command to continue"
+        ) from None
+    except (CommClosedError, OSError, TimeoutError) as error:
+        raise InputError(
+            f"the connection to the Dask scheduler is lost ({error or type(error).__name__}): start it, and repeat the "
+            "command to continue; finished parts are kept"
+        ) from None
+    finally:
+        for future in numbers:
+            future.release()
+
+
+class _Pickler(pickle.Pickler):
+    """Pickle structures of trees by a tree: their pickle breaks modules of equinox, which have no default values."""
+
+    def reducer_override(self, value: Any) -> Any:
+        if isinstance(value, jax.tree_util.PyTreeDef):
+            return jax.tree.structure, (jax.tree.unflatten(value, [0] * value.num_leaves),)
+        return NotImplemented
+
+
+def _pickled(study: Study) -> bytes:
+    with io.BytesIO() as buffer:
+        _Pickler(buffer).dump(study)
+        return buffer.getvalue()
+
+
+_prepared: dict[str, tuple[Study, Any]] = {}
+
+
+def _compute(name: str, pickled: bytes, part: Any) -> Any:
+    """Compute a part in a worker, which keeps what the last study prepared."""
+    if name not in _prepared:
+        _prepared.clear()
+        study = pickle.loads(pickled)
+        _prepared[name] = study, study.prepare()
+    study, prepared = _prepared[name]
+    return study.compute(prepared, part)
+
+
+@contextmanager
+def connected(workers: int | None, scheduler: str | None) -> Iterator["Client | None"]:
+    """Yield a client of a new local cluster of `workers`, or of the scheduler at an address; None without both.
+
+    Raises InputError for an address that is neither encrypted (tls://) nor on this machine, and without a scheduler.
+    """
+    if workers is None and scheduler is None:
+        yield None
+        return
+    with extra():
+        import dask
+        from distributed import Client, LocalCluster
+    if scheduler is not None:
+        at = urlsplit(scheduler if "://" in scheduler else f"tcp://{scheduler}")
+        if at.scheme != "tls" and at.hostname not in ("localhost", "127.0.0.1", "::1"):
+            raise InputError(
+                f"{scheduler}: data would travel unencrypted; use a tls:// address (docs/cluster.md), or one of this "
+                "machine (tcp://127.0.0.1:8786, such as that of an SSH tunnel)"
+            )
+        try:
+            client = Client(scheduler, timeout="20s")
+        except (OSError, ValueError, TimeoutError) as error:
+            raise InputError(
+                f"no Dask scheduler answers at {scheduler} ({error}): start it, or correct the address"
+            ) from None
+        with client:
+            yield client
+        return
+    count = workers or 1
+    deaths = {"distributed.scheduler.allowed-failures": _DEATHS, "distributed.worker.memory.terminate": False}
+    pin = _PIN.format(workers=count)
+    with (
+        dask.config.set(deaths),
+        LocalCluster(
+            n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, memory_limit=0,
+            preload=[pin], env=_ENVIRONMENT | {"JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu")},
+        ) as cluster,
+        Client(cluster) as client,
+    ):  # fmt: skip
+        yield client
