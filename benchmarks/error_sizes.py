@@ -50,6 +50,9 @@ def disturbed(block: Block, kind: str, rng: np.random.Generator) -> tuple[Block,
         label = "XYZ"[axis]
     size *= float(np.median(np.asarray(rows.sigma)[chosen]))
     value = np.asarray(rows.value) + np.where(chosen, size, 0.0)
+    if kind == "all control points":
+        # Findings name the opposite shift of the stations.
+        size = -size
     return block.with_observations({name: eqx.tree_at(lambda r: r.value, rows, value)}), label, size
 
 

@@ -34,6 +34,7 @@ QUICK = {
     ),
     "cloud": ("lidar/test_roofs.py",),
     "columns": ("test_block_from_arrays.py",),
+    "workers": ("test_workers.py::test_only_encrypted_or_local_schedulers_are_used",),
     "collinearity": ("georeferencing/test_direct.py",),
     "compiling": (
         "test_compiling.py::test_a_damaged_file_is_written_anew",
