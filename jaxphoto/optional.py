@@ -7,7 +7,7 @@ EXTRAS = {
     "laspy": "lidar", "lazrs": "lidar",
     "cv2": "photos", "pycolmap": "photos",
     "pyarrow": "parquet",
-    "dask": "cluster", "distributed": "cluster",
+    "cloudpickle": "cluster", "dask": "cluster", "distributed": "cluster",
 }  # fmt: skip
 """Extra of jaxphoto that installs each optional module."""
 

@@ -9,8 +9,10 @@ import io
 import os
 import pickle
 from collections.abc import Iterable, Iterator
+from concurrent.futures import CancelledError
 from contextlib import contextmanager
 from itertools import islice
+from threading import Lock
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
 from uuid import uuid4
@@ -25,7 +27,7 @@ if TYPE_CHECKING:
 
 # Number of parts per worker that are computed or wait for it: a worker never waits for the next part.
 _AHEAD = 2
-# Number of workers that may die while they compute a part. Then the part itself is too large, or wrong.
+# Number of workers of a local cluster that may die while they compute a part: more, and the part is too large.
 _DEATHS = 10
 # Runs in each worker before it imports JAX: divide the cores among the workers of this machine.
 _PIN = """
@@ -68,61 +70,74 @@ def in_parts(
         from distributed import KilledWorker, as_completed
         from distributed.comm import CommClosedError
     waiting, name, numbers = iter(parts), uuid4().hex, dict[Any, int]()
+    # As the result of a task, unlike scattered data, the study survives the death of the worker that holds it.
+    sent = client.submit(bytes, _pickled(study), key=f"study-{name}", pure=False)
+
+    def submit() -> list[Any]:
+        """Submit parts up to the number that the present workers need."""
+        if client.status != "running":
+            raise CommClosedError(f"the connection is {client.status}")
+        count = max(1, _AHEAD * len(client.nthreads()) - len(numbers))
+        new = {client.submit(_compute, name, sent, part, pure=False): k for k, part in islice(waiting, count)}
+        numbers.update(new)
+        return list(new)
+
     try:
-        # As the result of a task, unlike scattered data, the study survives the death of the worker that holds it.
-        sent = client.submit(bytes, _pickled(study), key=f"study-{name}", pure=False)
-
-        def submit(count: int) -> list[Any]:
-            new = {client.submit(_compute, name, sent, part, pure=False): k for k, part in islice(waiting, count)}
-            numbers.update(new)
-            return list(new)
-
-        running = as_completed(submit(_AHEAD * max(1, len(client.scheduler_info()["workers"]))))
+        running = as_completed(submit())
         for future in running:
-            result = future.result()
-            for following in submit(1):
+            number = numbers.pop(future)
+            for following in submit():
                 running.add(following)
-            yield numbers.pop(future), result
+            if future.status == "error":
+                raise future.exception()
+            yield number, future.result()
     except KilledWorker:
         raise InputError(
-            f"{_DEATHS} workers died while they computed one part, perhaps for lack of memory: use fewer workers per "
+            "several workers died while they computed one part, perhaps for lack of memory: use fewer workers per "
             "machine. Finished parts are kept; repeat the command to continue"
         ) from None
-    except (CommClosedError, OSError, TimeoutError) as error:
+    except (CommClosedError, CancelledError) as error:
+        why = str(error).partition("\n")[0] or type(error).__name__
         raise InputError(
-            f"the connection to the Dask scheduler is lost ({error or type(error).__name__}): start it, and repeat the "
-            "command to continue; finished parts are kept"
+            f"the connection to the Dask scheduler is lost ({why}): start it, and repeat the command to continue; "
+            "finished parts are kept"
         ) from None
     finally:
         for future in numbers:
             future.release()
 
 
-class _Pickler(pickle.Pickler):
-    """Pickle structures of trees by a tree: their pickle breaks modules of equinox, which have no default values."""
-
-    def reducer_override(self, value: Any) -> Any:
-        if isinstance(value, jax.tree_util.PyTreeDef):
-            return jax.tree.structure, (jax.tree.unflatten(value, [0] * value.num_leaves),)
-        return NotImplemented
-
-
 def _pickled(study: Study) -> bytes:
+    """Pickle a study; its functions that cannot be imported by name as code."""
+    with extra():
+        import cloudpickle
+
+    class Pickler(cloudpickle.Pickler):
+        """Pickle structures of trees by a tree: their own pickle breaks modules of equinox."""
+
+        def reducer_override(self, value: Any) -> Any:
+            if isinstance(value, jax.tree_util.PyTreeDef):
+                return jax.tree.structure, (jax.tree.unflatten(value, [0] * value.num_leaves),)
+            return super().reducer_override(value)
+
     with io.BytesIO() as buffer:
-        _Pickler(buffer).dump(study)
+        Pickler(buffer).dump(study)
         return buffer.getvalue()
 
 
 _prepared: dict[str, tuple[Study, Any]] = {}
+_one_at_a_time = Lock()
 
 
 def _compute(name: str, pickled: bytes, part: Any) -> Any:
     """Compute a part in a worker, which keeps what the last study prepared."""
-    if name not in _prepared:
-        _prepared.clear()
-        study = pickle.loads(pickled)
-        _prepared[name] = study, study.prepare()
-    study, prepared = _prepared[name]
+    # A worker may have several threads.
+    with _one_at_a_time:
+        if name not in _prepared:
+            _prepared.clear()
+            study = pickle.loads(pickled)
+            _prepared[name] = study, study.prepare()
+        study, prepared = _prepared[name]
     return study.compute(prepared, part)
 
 
@@ -160,7 +175,7 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator["Client | 
     with (
         dask.config.set(deaths),
         LocalCluster(
-            n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address=None, memory_limit=0,
+            n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0", memory_limit=0,
             preload=[pin], env=_ENVIRONMENT | {"JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu")},
         ) as cluster,
         Client(cluster) as client,

@@ -25,6 +25,15 @@ class Squares:
         return part**2 + prepared
 
 
+class Failing(Squares):
+    """A study whose second part cannot be computed."""
+
+    def compute(self, prepared, part):
+        if part[0] == 1:
+            raise OSError("no such table")
+        return part
+
+
 @pytest.fixture(scope="module")
 def client():
     with connected(2, None) as connection:
@@ -56,6 +65,15 @@ def test_every_part_is_computed_once_although_workers_die(client):
     assert found.keys() == here.keys()
     for number, result in here.items():
         np.testing.assert_array_equal(found[number], result)
+
+
+def test_errors_of_the_study_and_lost_schedulers_are_told_apart(client):
+    with pytest.raises(OSError, match="no such table"):
+        dict(in_parts(Failing(), [(k, np.full(3, float(k))) for k in range(5)], client))
+    with pytest.raises(InputError, match="connection to the Dask scheduler is lost"), connected(1, None) as own:
+        for number, _ in in_parts(Squares(), [(k, np.zeros(3)) for k in range(100)], own):
+            if number == 3:
+                own.cluster.close()
 
 
 def test_only_encrypted_or_local_schedulers_are_used():
