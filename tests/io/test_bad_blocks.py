@@ -91,6 +91,10 @@ CASES = {
         [(P, "x_mm,y_mm,sigma_x_mm,sigma_y_mm", "column_px,row_px,sigma_px,n"), (P, "1.15,0.2", "1.15,900.0")],
         ["image_points.csv, row 8", "row_px = 900", "height_px"],
     ),
+    "pixels of turned pictures": (
+        [(P, "", "image,point,column_px,row_px\na,p1,10,20\nb,p1,250,390\n")],
+        ["image_points.csv, row 3", "row_px = 390", "turned by 90 degrees"],
+    ),
     "angle in gon": ([(I, "-0.25,90.0", "-0.25,399.0")], ["images.csv, row 2", "kappa_deg = 399", "degrees"]),
     "attitude in gon": ([(A, "45.0", "390.0")], ["attitudes.csv, row 2", "yaw_deg = 390", "degrees"]),
     "distance to itself": ([(D, "p2,p3", "p2,p2")], ["distances.csv, row 3", "correct"]),

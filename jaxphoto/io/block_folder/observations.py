@@ -231,6 +231,8 @@ def _coordinates(table: Table, pixel: np.ndarray, half: np.ndarray) -> np.ndarra
     if pairs[0][0] == "column_px":
         hint = "give pixels from the upper left corner, and check the camera's width_px and height_px"
         xy = (values * pixel - half) * np.array([1.0, -1.0])
+        if (np.abs(values * pixel - half[..., ::-1]) <= half[..., ::-1]).all():
+            hint += "; all points fit with width and height exchanged: the pictures may have been turned by 90 degrees"
     for line, axis in np.argwhere(np.abs(xy) > _OUTSIDE * half)[:1]:
         raise table.bad(line, f"{pairs[0][axis]} = {values[line, axis]:g} is far outside the image; {hint}")
     return xy
