@@ -7,7 +7,7 @@ EXTRAS = {
     "laspy": "lidar", "lazrs": "lidar",
     "cv2": "photos", "pycolmap": "photos",
     "pyarrow": "parquet",
-    "cloudpickle": "cluster", "dask": "cluster", "distributed": "cluster",
+    "dask": "cluster", "distributed": "cluster",
 }  # fmt: skip
 """Extra of jaxphoto that installs each optional module."""
 

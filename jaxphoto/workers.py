@@ -109,8 +109,8 @@ def in_parts(
 
 def _pickled(study: Study) -> bytes:
     """Pickle a study; its functions that cannot be imported by name as code."""
-    with extra():
-        import cloudpickle
+    # Dask requires it.
+    import cloudpickle
 
     class Pickler(cloudpickle.Pickler):
         """Pickle structures of trees by a tree: their own pickle breaks modules of equinox."""

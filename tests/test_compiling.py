@@ -157,8 +157,11 @@ def test_what_others_could_have_written_is_not_run(kept, monkeypatch):
 
 
 def test_nothing_that_is_read_runs_by_itself():
-    """No module of jaxphoto reads pickles, which may be anybody's."""
-    for path in (ROOT / "jaxphoto").rglob("*.py"):
+    """No module of jaxphoto reads pickles, which may be anybody's.
+
+    Workers read those of their own Dask client, on whose behalf Dask runs any code.
+    """
+    for path in {*(ROOT / "jaxphoto").rglob("*.py")} - {ROOT / "jaxphoto" / "workers.py"}:
         words = set(re.findall(r"\w+", path.read_text()))
         assert not words & {"unpickle", "cPickle", "dill", "cloudpickle", "joblib", "marshal", "read_pickle"}, path
         assert "import pickle" not in path.read_text(), path

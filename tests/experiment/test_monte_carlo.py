@@ -94,7 +94,7 @@ def test_of_a_large_block_every_batch_is_kept(tmp_path, monkeypatch):
     made = study(tmp_path / "run", draws=200)
 
     def stop(done: int) -> None:
-        if done > made.run.batch_size:
+        if done >= made.run.batch_size:
             raise Stop
 
     with pytest.raises(Stop):
