@@ -92,7 +92,7 @@ def _work(problem: Problem) -> None:
     # As many as are worth compiling thoroughly.
     drawn = np.random.default_rng(777).normal(size=(1000, len(errors.sigma))) * errors.sigma
     run = Readjustment(solve(block, block.start.unknowns, block.priors), errors.applied, drawn)
-    run.prepare()
+    run.warm_up()
     for _ in sys.stdin:
         print(json.dumps(_once(run, drawn)), flush=True)
 

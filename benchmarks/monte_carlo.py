@@ -144,7 +144,7 @@ def _work(problem: Problem, drawn: np.ndarray) -> None:
     """The worker: compile, then all draws once for each line."""
     block = block_of(problem, "draws")
     run = Readjustment(solve(block, block.start.unknowns, block.priors), _change(problem), drawn)
-    run.prepare()
+    run.warm_up()
     for _ in sys.stdin:
         print(json.dumps(_once(run, drawn)), flush=True)
 

@@ -1,8 +1,8 @@
 """Studies in parts: in this process, or on the workers of a Dask scheduler (extra `cluster`).
 
-A study is data and two methods: `prepare` compiles its programs, once per worker, and `compute` returns the result of a
-part as arrays. It travels once to the scheduler, which passes it on; results return to this process, which writes all
-files, so the machines need no common file system. Results do not depend on the number of workers or their order.
+A study is data with a method `compute` that returns the result of a part as arrays. It travels once to the scheduler,
+which passes it on; each worker keeps it, with what it compiled. Results return to this process, which writes all files,
+so the machines need no common file system. Results do not depend on the number of workers or their order.
 """
 
 import io
@@ -46,10 +46,7 @@ _ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1", "OMP_NUM_THREADS": "1", "MKL_NUM_TH
 class Study(Protocol):
     """Computation in independent parts; it is pickled for other processes."""
 
-    def prepare(self) -> Any:
-        """Compile what all parts need."""
-
-    def compute(self, prepared: Any, part: Any) -> Any:
+    def compute(self, part: Any) -> Any:
         """Return the result of a part, as NumPy arrays."""
 
 
@@ -62,9 +59,8 @@ def in_parts(
     or its workers are lost.
     """
     if client is None:
-        prepared = study.prepare()
         for number, part in parts:
-            yield number, study.compute(prepared, part)
+            yield number, study.compute(part)
         return
     with extra():
         from distributed import KilledWorker, as_completed
@@ -125,20 +121,19 @@ def _pickled(study: Study) -> bytes:
         return buffer.getvalue()
 
 
-_prepared: dict[str, tuple[Study, Any]] = {}
+_studies: dict[str, Study] = {}
 _one_at_a_time = Lock()
 
 
 def _compute(name: str, pickled: bytes, part: Any) -> Any:
-    """Compute a part in a worker, which keeps what the last study prepared."""
+    """Compute a part in a worker, which keeps the last study."""
     # A worker may have several threads.
     with _one_at_a_time:
-        if name not in _prepared:
-            _prepared.clear()
-            study = pickle.loads(pickled)
-            _prepared[name] = study, study.prepare()
-        study, prepared = _prepared[name]
-    return study.compute(prepared, part)
+        if name not in _studies:
+            _studies.clear()
+            _studies[name] = pickle.loads(pickled)
+        study = _studies[name]
+    return study.compute(part)
 
 
 @contextmanager

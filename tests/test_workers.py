@@ -16,19 +16,16 @@ pytest.importorskip("distributed", reason="distributed is not installed (extra c
 
 
 class Squares:
-    """The squares of arrays, plus what is prepared."""
+    """The squares of arrays."""
 
-    def prepare(self):
-        return 0.5
-
-    def compute(self, prepared, part):
-        return part**2 + prepared
+    def compute(self, part):
+        return part**2
 
 
 class Failing(Squares):
     """A study whose second part cannot be computed."""
 
-    def compute(self, prepared, part):
+    def compute(self, part):
         if part[0] == 1:
             raise OSError("no such table")
         return part
@@ -46,7 +43,7 @@ def test_draws_of_workers_are_those_of_this_process(client):
     found = monte_carlo(adjusted, errors, 300, seed=3, exterior=True, client=client)
     change = DrawnChange(errors, 3)
     here = Readjustment(adjusted, change, np.arange(300), exterior=True, devices=1)
-    own = here.compute(here.prepare(), np.arange(300))
+    own = here.compute(np.arange(300))
     assert found.converged.all()
     for name in ("shared", "exterior", "steps"):
         np.testing.assert_array_equal(getattr(found, name), getattr(own, name))

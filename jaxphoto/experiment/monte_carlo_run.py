@@ -65,15 +65,17 @@ class MonteCarlo:
             if not folder.done:
                 missing = folder.missing_parts()
                 done = folder.draws - sum(map(self._size, missing))
+                if client is None:
+                    self.run.warm_up()
                 began = time.perf_counter()
                 for part, draws in in_parts(self.run, ((k, self._errors(k)) for k in missing), client):
-                    recorded = dict(zip(self.drawn.names, self._errors(part).T, strict=True))
-                    draws = dataclasses.replace(draws, recorded=recorded if self.drawn.recorded else {})
+                    errors = zip(self.drawn.names, self._errors(part).T, strict=True) if self.drawn.recorded else ()
+                    draws = dataclasses.replace(draws, recorded=dict(errors))
                     folder.write_part(part, draws_table(draws, self.run.adjusted, part * folder.per_part))
                     self.computed += self._size(part)
                     done += self._size(part)
                     progress(done)
-                self.seconds = time.perf_counter() - began - self.run.seconds["compile"]
+                self.seconds = time.perf_counter() - began
                 folder.join()
             folder.tidy()
 

@@ -181,16 +181,15 @@ class Readjustment:
         """Return the largest number of draws up to `draws` that fills batches; at least one batch."""
         return self.batch_size * max(1, draws // self.batch_size)
 
-    def prepare(self) -> "Readjustment":
+    def warm_up(self) -> None:
         """Compile the programs of `batches`."""
         began = time.perf_counter()
         self._fetch(*self._start(self.first, first_only=False), 1)
         self.seconds["compile"] = time.perf_counter() - began
-        return self
 
-    def compute(self, prepared: "Readjustment", part: Any) -> Draws:
+    def compute(self, part: Any) -> Draws:
         """Return the draws of the entries of a part."""
-        return join_draws(list(prepared.batches(part)))
+        return join_draws(list(self.batches(part)))
 
     def __reduce__(self):
         # Equinox' bound methods cannot be pickled.
