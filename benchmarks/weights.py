@@ -113,7 +113,7 @@ def flights(name: str, seeds: range) -> Iterator[Flight]:
         if bool(adjusted.converged):
             estimated = estimate_weights(adjusted)
             best = estimated.adjusted if estimated else adjusted
-            factors = dict(zip(estimated.labels, np.sqrt(estimated.factor).tolist(), strict=True)) if estimated else {}
+            factors = estimated.sigma_factors if estimated else {}
             yield Flight(_errors(adjusted, simulated.truth), _errors(best, simulated.truth), factors)
 
 

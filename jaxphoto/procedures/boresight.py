@@ -27,6 +27,7 @@ from jaxphoto.georeferencing import Mount, StripBias
 from jaxphoto.initial.approximate import approximate
 from jaxphoto.observations import AXES
 from jaxphoto.procedures.adjust import adjust
+from jaxphoto.procedures.weights import estimate_weights
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics import (
     LEVEL,
@@ -352,6 +353,14 @@ def boresight(
         last = steps[-1] if steps else None
         posed = step_block(block, number, last.biases, last.adjusted.unknowns) if last else step_block(block, number)
         step = judge(number, adjust(posed, max_steps=max_steps), last)
+        # Step 4 has the weights of step 3: the variance of their difference requires it.
+        fits = number < 4 and bool(step.adjusted.converged) and float(step.adjusted.sigma0) < LARGE_SIGMA0
+        weights = estimate_weights(step.adjusted, report=report) if fits else None
+        # Larger residuals than stated are what the steps test for.
+        if weights and max(weights.sigma_factors.values()) < 1:
+            block = block.with_observations(weights.adjusted.block.named_observations)
+            step = judge(number, weights.adjusted, last)
+            step = dataclasses.replace(step, findings=(weights.words, *step.findings))
         steps.append(step)
         if not (step.go_on or (go_on and bool(step.adjusted.converged))):
             break

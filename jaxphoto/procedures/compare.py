@@ -25,6 +25,7 @@ from jaxphoto.block_edits import one_camera
 from jaxphoto.camera import InteriorOrientation, parameter_names
 from jaxphoto.errors import BlockError, DatumError, InputError, RankError
 from jaxphoto.procedures.adjust import adjust
+from jaxphoto.procedures.weights import estimate_weights
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.stability import (
     Change,
@@ -40,7 +41,7 @@ from jaxphoto.stability import (
     leading_unit,
     overlap,
 )
-from jaxphoto.statistics import common_covariance, covariance
+from jaxphoto.statistics import VarianceComponents, common_covariance, covariance
 from jaxphoto.tracing import outside_transformations
 from jaxphoto.variants import some_images
 
@@ -106,7 +107,7 @@ class Halves(NamedTuple):
     """Calibration by the whole block and by its halves, and the reliability of its standard deviations."""
 
     adjusted: Adjustment
-    """Adjustment of the whole block."""
+    """Adjustment of the whole block, with estimated weights."""
     camera: str
     by: str
     method: Method
@@ -121,6 +122,8 @@ class Halves(NamedTuple):
     failed: tuple[Cut, ...]
     """Splits that could not be compared."""
     band: ErrorBand
+    weights: VarianceComponents | None = None
+    """Variance components of parts whose residuals contradict their stated standard deviations (`estimate_weights`)."""
 
     @property
     def widened(self) -> Float[np.ndarray, "parameters parameters"]:
@@ -159,6 +162,8 @@ def halves(
 ) -> Halves:
     """Adjust `block` and random halves of it, and compare `camera` at `cells_mm` (`image_grid`).
 
+    Standard deviations that the residuals of the whole block contradict are estimated (`estimate_weights`).
+
     `by` is the unit that is never split: "image", "strip", or a partition of the block such as "day". `n_cuts` splits
     are drawn with `seed`, or all if fewer exist. `method` defines which systematic effects the orientation of the
     images absorbs (`stability.alignment`).
@@ -173,6 +178,8 @@ def halves(
     adjusted = adjust(block, sizes=sizes)
     if not bool(adjusted.converged):
         raise InputError(f"the whole block did not converge: {adjusted.outcome.value}")
+    weights = estimate_weights(adjusted, report=report)
+    adjusted = weights.adjusted if weights else adjusted
     interior = adjusted.unknowns.interior[name]
     camera_covariance = covariance(adjusted).of_interior(name, parameter_names(interior))
     if not camera_covariance.any():
@@ -199,7 +206,7 @@ def halves(
     return Halves(
         adjusted=adjusted, camera=name, by=by, method=method, cells_mm=cells_mm, covariance=camera_covariance,
         promised_px=np.sqrt(np.trace(whole, axis1=1, axis2=2)), cuts=cuts,
-        failed=tuple(cut for cut in done if cut.problem), band=error_band(differences, whole),
+        failed=tuple(cut for cut in done if cut.problem), band=error_band(differences, whole), weights=weights,
     )  # fmt: skip
 
 

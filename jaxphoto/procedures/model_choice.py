@@ -39,7 +39,8 @@ from jaxphoto.errors import BlockError, DatumError, InputError, RankError
 from jaxphoto.georeferencing import apparent_point
 from jaxphoto.observations import ImagePoints
 from jaxphoto.procedures.adjust import adjust
-from jaxphoto.statistics import Significance, covariance, significance
+from jaxphoto.procedures.weights import estimate_weights
+from jaxphoto.statistics import Significance, VarianceComponents, covariance, significance
 from jaxphoto.unknowns import FIXED, FREE, Unknowns, Weighted
 
 
@@ -252,6 +253,8 @@ class ModelChoice(NamedTuple):
     n_left_out: int
     by_bic: str
     by_prediction: str
+    weights: VarianceComponents | None = None
+    """Variance components that all candidates use, estimated with the one of least BIC (`estimate_weights`)."""
 
 
 def model_choice(
@@ -265,7 +268,8 @@ def model_choice(
     """Compare candidates (`candidate_of`) for all cameras of `block`; `k` = 0 omits cross-validation.
 
     c, x_p and y_p keep their priors (`with_candidate`); the coefficients of a candidate are free. `problem` is the
-    reason if a candidate cannot be adjusted. `report` receives progress.
+    reason if a candidate cannot be adjusted. `report` receives progress. Standard deviations that the residuals of the
+    candidate with the least BIC contradict are estimated (`estimate_weights`), for all candidates.
 
     Raises InputError for unknown or repeated candidates or fewer than two folds, BlockError if no image point can be
     omitted.
@@ -278,25 +282,49 @@ def model_choice(
         raise InputError(f"{k} folds: give 2 or more, or 0 for no cross-validation")
     fold = folds(block, k, seed) if k else np.full(len(block.image_points.image), -1)
     _, sizes = fold_blocks(block, fold)
-    judged: list[Judged] = []
-    squares: list[np.ndarray | None] = []
-    unknowns: Unknowns | None = None
+    count = lambda n: report(f"comparing {len(names)} models: adjustment {n} of {len(names) * (k + 2)}")  # noqa: E731
+    judged, squares, best = _evaluated(block, candidates, np.full(len(fold), -1), sizes, None, count)
+    weights = estimate_weights(best, report=report) if best is not None else None
+    if weights:
+        block = block.with_observations(weights.adjusted.block.named_observations)
+    if best is not None and (weights or k):
+        more = lambda n: count(len(names) + n)  # noqa: E731
+        judged, squares, _ = _evaluated(block, candidates, fold, sizes, best.unknowns, more)
+    return _compared(judged, squares, int((fold >= 0).sum()))._replace(weights=weights)
+
+
+def _evaluated(
+    block: Block,
+    candidates: list[Candidate],
+    fold: Int[np.ndarray, "rows"],
+    sizes: PaddedSizes,
+    unknowns: Unknowns | None,
+    count: Callable[[int], object],
+) -> tuple[list[Judged], list[np.ndarray | None], Adjustment | None]:
+    """Adjust with each candidate; return results, squared prediction errors, and the adjustment with the least BIC.
+
+    Orientations and points start at `unknowns`, or at those of the first candidate that converges.
+    """
+    judged, squares, best = list[Judged](), list[np.ndarray | None](), None
     for number, candidate in enumerate(candidates):
-        counted = lambda fold, first=1 + number * (k + 1): report(  # noqa: E731
-            f"comparing {len(names)} models: adjustment {first + fold} of {len(names) * (k + 1)}"
-        )
-        counted(0)
+        first = 1 + number * (fold.max() + 2)
+        count(first)
         posed = with_candidate(block, candidate, unknowns)
+        result, predicted = Judged(candidate), None
         try:
             adjusted = adjust(posed, None if unknowns is None else posed.start.unknowns, sizes=sizes)
             result = _judge(candidate, adjusted)
-            squares.append(_predicted(posed, adjusted, fold, sizes, counted) if k else None)
-            unknowns = adjusted.unknowns if unknowns is None and bool(adjusted.converged) else unknowns
+            if bool(adjusted.converged):
+                unknowns = adjusted.unknowns if unknowns is None else unknowns
+                if result.bic < min((j.bic for j in judged if np.isfinite(j.bic)), default=np.inf):
+                    best = adjusted
+                if (fold >= 0).any():
+                    predicted = _predicted(posed, adjusted, fold, sizes, lambda n, first=first: count(first + n))
         except (BlockError, DatumError, RankError) as error:
             result = Judged(candidate, str(error))
-            squares.append(None)
         judged.append(result)
-    return _compared(judged, squares, int((fold >= 0).sum()))
+        squares.append(predicted)
+    return judged, squares, best
 
 
 def _judge(candidate: Candidate, adjusted: Adjustment) -> Judged:
@@ -326,8 +354,6 @@ def _predicted(
     block: Block, adjusted: Adjustment, fold: np.ndarray, sizes: PaddedSizes, counted: Callable[[int], object]
 ) -> Float[np.ndarray, "left_out"] | None:
     """Return squared prediction errors (px) of all rows that are ever omitted; None if a fold does not converge."""
-    if not bool(adjusted.converged):
-        return None
     squares = np.full(len(fold), _NAN)
     parts, _ = fold_blocks(block, fold)
     for number, part in enumerate(parts):

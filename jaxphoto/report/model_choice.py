@@ -88,6 +88,8 @@ def choice_verdict(choice: ModelChoice) -> list[str]:
             f"{choice.by_prediction} is the smallest model that predicts {choice.n_left_out} held-out image points "
             "within one standard error of the best"
         )
+    if choice.weights:
+        sentences.append(choice.weights.words)
     return sentences + [f"{j.candidate.name} could not be adjusted: {j.problem}" for j in choice.judged if j.problem]
 
 

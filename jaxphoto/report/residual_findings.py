@@ -509,17 +509,15 @@ def _estimated_weights(components: statistics.VarianceComponents, stated: Tables
 
     Only those of matched image points are usually unknown: factors of other groups are a warning.
     """
-    of_parts = zip(components.labels, np.sqrt(components.factor).tolist(), components.supported, strict=True)
-    factors = {label: factor for label, factor, supported in of_parts if supported}
+    factors = components.sigma_factors
     worst = max(factors, key=lambda label: abs(np.log(factors[label])))
     usual = all(label.startswith(IMAGE_POINTS) and ANOTHER_UNIT < f < NOTHING_FITS for label, f in factors.items())
     labels, effect = estimated.adjusted.structure.labels, ""
     if path := next((label for label in labels if label.endswith(".c_mm")), ""):
         new, old = (float(t.covariance.shared_sigma[labels.index(path)]) for t in (estimated, stated))
         effect = f"; sigma of {path} {new:.2g} mm instead of {old:.2g} mm"
-    subject = few([f"{label.replace('_', ' ')} {f:.3g}" for label, f in factors.items()])
     severity: Severity = "note" if usual else "warning"
-    return Finding("weights", severity, subject, factors[worst], 1.0, numbers={"effect": effect})
+    return Finding("weights", severity, components.words, factors[worst], 1.0, numbers={"effect": effect})
 
 
 def _other_explanations(stated: Tables, estimated: Tables) -> Iterator[Finding]:

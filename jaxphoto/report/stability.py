@@ -363,6 +363,8 @@ def halves_verdict(halves: Halves) -> list[str]:
             f"{len(halves.failed)} of {n + len(halves.failed)} splits could not be compared, the first: "
             f"{halves.failed[0].problem}"
         )
+    if halves.weights:
+        sentences.append(halves.weights.words)
     return [*sentences, "errors common to both halves, such as those of fixed points, are undetectable"]
 
 

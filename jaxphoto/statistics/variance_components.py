@@ -44,7 +44,7 @@ from jaxtyping import Bool, Float, Int, Shaped
 from jaxphoto.adjustment import MAX_STEPS, Adjustment, solve
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.block import Block
-from jaxphoto.errors import InputError, counted
+from jaxphoto.errors import InputError, counted, few
 from jaxphoto.observations import AXES, AbstractObservations, Correlated, ImagePoints
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.covariance import covariance
@@ -337,6 +337,18 @@ class VarianceComponents(eqx.Module):
     def degrees(self) -> Float[np.ndarray, "parts"]:
         """Degrees of freedom of the factors: 2 / variance, as for chi-square divided by its degrees of freedom."""
         return 2 * (self.factor / self.sigma) ** 2
+
+    @property
+    def sigma_factors(self) -> dict[str, float]:
+        """Factors of the standard deviations of the supported parts, by label."""
+        of_parts = zip(self.labels, np.sqrt(self.factor).tolist(), self.supported, strict=True)
+        return {label: factor for label, factor, supported in of_parts if supported}
+
+    @property
+    def words(self) -> str:
+        """The factors of the standard deviations in words."""
+        factors = few([f"{label.replace('_', ' ')} {factor:.3g}" for label, factor in self.sigma_factors.items()])
+        return f"standard deviations are estimated from the residuals, times the stated ones: {factors}"
 
 
 class _Step(NamedTuple):

@@ -7,10 +7,12 @@ import numpy as np
 import pytest
 
 from benchmarks.weights import coverage, flights
-from jaxphoto import adjust, covariance, estimate_weights, variance_components
+from jaxphoto import adjust, covariance, estimate_weights, halves, variance_components
+from jaxphoto.procedures.model_choice import model_choice
 from jaxphoto.procedures.snooping import inflated_components
 from jaxphoto.report import component_findings
 from jaxphoto.simulation import remeasure
+from jaxphoto.stability import image_grid
 from tests.blocks import adjusted_example, calibration_flight, example, free_network
 
 
@@ -75,6 +77,18 @@ def test_a_wrong_sigma_of_image_points_is_estimated_and_no_other(block, factor):
     # Standard deviations are those of the block with the right weights.
     sigmas = [np.asarray(covariance(a).shared_sigma) for a in (estimated.adjusted, adjusted)]
     np.testing.assert_allclose(*sigmas, rtol=0.1)
+
+
+def test_models_and_halves_use_estimated_sigmas(block):
+    wrong = with_sigmas_times(block, {"image_points": 3.0})
+    sigmas = [
+        {s.parameter: s.sigma for s in model_choice(b, ["brown:k1+k2"], k=0).judged[0].parameters}
+        for b in (block, wrong)
+    ]
+    assert sigmas[1] == pytest.approx(sigmas[0], rel=0.1)
+    cells = image_grid(block.sensors["kodak"], 5, 5)
+    ratio = halves(wrong, cells, n_cuts=2).promised_px / halves(block, cells, n_cuts=2).promised_px
+    assert ratio == pytest.approx(1.0, rel=0.1)
 
 
 def test_a_common_shift_is_no_wrong_sigma():
