@@ -319,7 +319,8 @@ def _evaluated(
                 if result.bic < min((j.bic for j in judged if np.isfinite(j.bic)), default=np.inf):
                     best = adjusted
                 if (fold >= 0).any():
-                    predicted = _predicted(posed, adjusted, fold, sizes, lambda n, first=first: count(first + n))
+                    after = lambda n, first=first: count(first + n)  # noqa: E731
+                    predicted = _predicted(posed, adjusted, fold, sizes, after)
         except (BlockError, DatumError, RankError) as error:
             result = Judged(candidate, str(error))
         judged.append(result)
