@@ -1,4 +1,4 @@
-"""JAX devices over which a computation is sharded."""
+"""JAX devices and cores over which a computation is distributed."""
 
 from typing import Any
 
@@ -17,6 +17,11 @@ def usable(wanted: int) -> int:
     """
     each = min(wanted // jax.process_count(), *map(len, _devices_by_process()))
     return max(1, each * jax.process_count())
+
+
+def cores() -> int:
+    """Return the number of threads that run programs of one device at the same time: the cores of this process."""
+    return len(jax.local_devices()) if jax.default_backend() == "cpu" else 1
 
 
 def mesh_of(shards: int) -> Mesh:

@@ -9,7 +9,7 @@ import io
 import os
 import pickle
 from collections.abc import Iterable, Iterator
-from concurrent.futures import CancelledError
+from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from itertools import islice
 from threading import Lock
@@ -25,7 +25,7 @@ from jaxphoto.optional import extra
 if TYPE_CHECKING:
     from distributed import Client
 
-# Number of parts per worker that are computed or wait for it: a worker never waits for the next part.
+# Number of parts per worker or thread that are computed or wait for it: none of them waits for the next part.
 _AHEAD = 2
 # Number of workers of a local cluster that may die while they compute a part: more, and the part is too large.
 _DEATHS = 10
@@ -51,16 +51,15 @@ class Study(Protocol):
 
 
 def in_parts(
-    study: Study, parts: Iterable[tuple[int, Any]], client: "Client | None" = None
+    study: Study, parts: Iterable[tuple[int, Any]], client: "Client | None" = None, threads: int = 1
 ) -> Iterator[tuple[int, Any]]:
     """Yield number and result of each numbered part as it is computed.
 
-    Without a `client` of a Dask scheduler, the parts are computed here, in order. Raises InputError if the scheduler
-    or its workers are lost.
+    Without a `client` of a Dask scheduler, the parts are computed here, in some `threads`. Raises InputError if the
+    scheduler or its workers are lost.
     """
     if client is None:
-        for number, part in parts:
-            yield number, study.compute(part)
+        yield from _in_threads(study, iter(parts), threads)
         return
     with extra():
         from distributed import KilledWorker, as_completed
@@ -101,6 +100,26 @@ def in_parts(
     finally:
         for future in numbers:
             future.release()
+
+
+def _in_threads(study: Study, parts: Iterator[tuple[int, Any]], threads: int) -> Iterator[tuple[int, Any]]:
+    """Yield the results of all parts computed in this process."""
+    # The first part compiles; with one thread, it is followed by all others.
+    for number, part in parts if threads == 1 else islice(parts, 1):
+        yield number, study.compute(part)
+    running = dict[Future[Any], int]()
+    with ThreadPoolExecutor(threads) as pool:
+        try:
+            while True:
+                new = islice(parts, _AHEAD * threads - len(running))
+                running |= {pool.submit(study.compute, part): number for number, part in new}
+                if not running:
+                    return
+                for future in wait(running, return_when=FIRST_COMPLETED).done:
+                    yield running.pop(future), future.result()
+        finally:
+            for future in running:
+                future.cancel()
 
 
 def _pickled(study: Study) -> bytes:

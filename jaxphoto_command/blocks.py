@@ -230,7 +230,6 @@ def monte_carlo(
     from jaxphoto.procedures.adjust import adjust
     from jaxphoto.report.draws import print_draws, write_draws_page
     from jaxphoto.sensitivity import Readjustment, bias, check_draws, noise
-    from jaxphoto.sensitivity.monte_carlo import MAX_DEVICES
     from jaxphoto.workers import connected
 
     check_draws(draws)
@@ -252,9 +251,7 @@ def monte_carlo(
         progress.update("preparing the draws")
         drawn_sigmas = np.broadcast_to(drawn.sigma, (draws, len(drawn.sigma)))
         kept = {name: name in (keep or ()) for name in ("exterior", "points")}
-        # On one device per worker, results do not depend on the numbers of cores.
-        most = MAX_DEVICES if workers is None and scheduler is None else 1
-        run = Readjustment(adjusted, drawn.applied, drawn_sigmas, **kept, devices=most)
+        run = Readjustment(adjusted, drawn.applied, drawn_sigmas, **kept)
         warn_of_contradictions(adjusted, output)
         study = MonteCarlo(read, run, drawn, draws, seed, out)
         with connected(workers, scheduler) as client:

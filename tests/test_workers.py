@@ -42,7 +42,7 @@ def test_draws_of_workers_are_those_of_this_process(client):
     errors = bias(example(), "station", 0.1, per="image")
     found = monte_carlo(adjusted, errors, 300, seed=3, exterior=True, client=client)
     change = DrawnChange(errors, 3)
-    here = Readjustment(adjusted, change, np.arange(300), exterior=True, devices=1)
+    here = Readjustment(adjusted, change, np.arange(300), exterior=True)
     own = here.compute(np.arange(300))
     assert found.converged.all()
     for name in ("shared", "exterior", "steps"):

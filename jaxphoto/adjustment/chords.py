@@ -8,17 +8,15 @@ converges to the optimum of draw i, because its gradient is exact. The rate of c
 between N and the draw's own normal matrix. Draws whose steps do not contract need a full adjustment.
 """
 
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import equinox as eqx
 import jax
 import jax.numpy as jnp
-from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment.draw_gradients import Common, Varying, image_gradients, other_gradients, states
 from jaxphoto.adjustment.model.numbers import Increments, UnknownArrays
-from jaxphoto.devices import AXIS, mesh_of
 
 TOLERANCE = 1e-6
 """Maximum remaining distance of an unknown of a draw from its optimum, as a fraction of its standard deviation."""
@@ -52,36 +50,8 @@ class Way(NamedTuple):
 
 
 @eqx.filter_jit
-def find_optima(varying: Varying, common: Common, devices: int, first_only: bool) -> Found:
-    """Find the optimum of every draw, sharded over `devices`; `first_only` returns the first-order approximation."""
-    if devices == 1:
-        return _find(varying, common, first_only)
-    last = lambda v: P(*[None] * (v.ndim - 1), AXIS)  # noqa: E731
-    arrays, rest = eqx.partition(common, eqx.is_array)
-
-    def of_device(varying, arrays):
-        return _find(varying, eqx.combine(arrays, rest), first_only)
-
-    run = jax.shard_map(
-        of_device,
-        mesh=mesh_of(devices),
-        in_specs=(jax.tree.map(last, varying), P()),
-        out_specs=_draws_last(),
-        check_vma=False,
-    )
-    return run(varying, arrays)
-
-
-def _draws_last() -> Any:
-    """Specify results sharded over draws."""
-    each: Any = P(AXIS)
-    position, rotation, shared, points = (P(*[None] * axes, AXIS) for axes in (2, 3, 1, 2))
-    state: Any = (position, rotation, shared, points)
-    return Found(UnknownArrays(*state), each, each)
-
-
-def _find(varying: Varying, common: Common, first_only: bool) -> Found:
-    """Find the optima of the draws on one device."""
+def find_optima(varying: Varying, common: Common, first_only: bool) -> Found:
+    """Find the optimum of every draw; `first_only` returns the first-order approximation."""
     way = chord_steps(varying, common, first_only)
     return Found(states(way.y, varying, common), way.settled, way.steps)
 

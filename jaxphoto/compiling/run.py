@@ -46,6 +46,7 @@ _programs: dict[object, _Program] = {}
 _gone = 0
 """Number of programs dropped since the last `jax.clear_caches`."""
 _prepared: dict[object, Future[_Program | None]] = {}
+_lock = threading.Lock()
 _workers = ThreadPoolExecutor(max_workers=os.cpu_count(), thread_name_prefix="jaxphoto-compile")
 keep_freed_memory()
 
@@ -62,7 +63,8 @@ def run_compiled(function: Any, arguments: tuple, seconds: dict[str, float], nam
     if found is None:
         return function(*arguments)
     key, arrays = found
-    prepared, program = _prepared.pop(key, None), _programs.pop(key, None)
+    with _lock:
+        prepared, program = _prepared.pop(key, None), _programs.get(key)
     new = program is None
     if prepared is not None:
         program = prepared.result()
@@ -118,14 +120,15 @@ def _keep(key: object, program: _Program) -> None:
     also clears the functions that the calling process has compiled; they are recompiled when called.
     """
     global _gone
-    _programs.pop(key, None)
-    _programs[key] = program
-    while len(_programs) > MOST:
-        del _programs[next(iter(_programs))]
-        _gone += 1
-    if _gone >= MOST:
-        _gone = 0
-        jax.clear_caches()
+    with _lock:
+        _programs.pop(key, None)
+        _programs[key] = program
+        while len(_programs) > MOST:
+            del _programs[next(iter(_programs))]
+            _gone += 1
+        if _gone >= MOST:
+            _gone = 0
+            jax.clear_caches()
 
 
 def _key_and_arrays(function: Any, arguments: tuple, thorough: bool) -> tuple[object, list] | None:
@@ -209,7 +212,6 @@ def _lowered(function: Any, arguments: tuple) -> tuple[jax.stages.Lowered, Any]:
 
 
 _THRESHOLD = "jax_persistent_cache_min_compile_time_secs"
-_lock = threading.Lock()
 _kept_out: list[float] = []
 """Value of the user's threshold, once per compilation in progress in `_not_in_cache`."""
 

@@ -14,6 +14,7 @@ import numpy as np
 import pandas as pd
 
 from jaxphoto.block import Block
+from jaxphoto.devices import cores
 from jaxphoto.io.draws_folder import DrawsFolder, digest_of
 from jaxphoto.io.text_files import read_json
 from jaxphoto.report.draws import draws_table, in_degrees, summary_table
@@ -48,7 +49,7 @@ class MonteCarlo:
             "block": digest_of(block), "errors": _errors_line(drawn), "sigma": _sigma_line(drawn), "seed": seed,
             # Identify the distribution, which has no name, by its first draws.
             "first_draws": _digest(np.asarray(self.keys(np.arange(4)))),
-            "exterior": run.exterior, "points": run.points, "devices": run.devices, "thorough": run.many,
+            "exterior": run.exterior, "points": run.points, "thorough": run.many,
             "versions": versions(),
         }  # fmt: skip
         self.folder = DrawsFolder(directory, settings, draws, part)
@@ -68,7 +69,7 @@ class MonteCarlo:
                 if client is None:
                     self.run.warm_up()
                 began = time.perf_counter()
-                for part, draws in in_parts(self.run, ((k, self._errors(k)) for k in missing), client):
+                for part, draws in in_parts(self.run, ((k, self._errors(k)) for k in missing), client, cores()):
                     errors = zip(self.drawn.names, self._errors(part).T, strict=True) if self.drawn.recorded else ()
                     draws = dataclasses.replace(draws, recorded=dict(errors))
                     folder.write_part(part, draws_table(draws, self.run.adjusted, part * folder.per_part))

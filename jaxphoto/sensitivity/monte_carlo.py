@@ -1,8 +1,7 @@
 """Monte Carlo simulation of an adjustment: thousands of re-adjustments of a block, each iterated to convergence.
 
 All draws share the factor of the nominal normal matrix (`chords`). Draws for which this iteration does not contract are
-adjusted individually and counted. The batch size depends only on the block and the number of devices, so a draw does
-not depend on other draws.
+adjusted individually and counted. The batch size depends only on the block, so a draw does not depend on other draws.
 """
 
 import dataclasses
@@ -26,7 +25,7 @@ from jaxphoto.argument_checks import require
 from jaxphoto.arrays import to_numpy
 from jaxphoto.block import Block, Start
 from jaxphoto.compiling import call_compiled
-from jaxphoto.devices import usable
+from jaxphoto.devices import cores
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.rotation import omega_phi_kappa_from_matrix
 from jaxphoto.sensitivity.perturbation import Perturbation, Recorded, in_order_of
@@ -36,10 +35,8 @@ from jaxphoto.workers import in_parts
 
 # Minimum number of draws for optimised compilation.
 _MANY = 500
-MAX_DEVICES = 1024
-"""Maximum number of devices."""
-# Maximum number of draws per part.
-_PART = 1000
+# Maximum number of draws per part; minimum number of parts, as work for several cores.
+_PART, _PARTS = 1000, 32
 
 
 @pretty_repr
@@ -109,11 +106,10 @@ def readjust(
     require(adjusted, Adjustment, "give the result of jaxphoto.adjust(block)")
     if not callable(change):
         raise InputError(f"{change!r} is no function of a block; give one, such as jaxphoto.bias(block, ...)")
-    devices = 1 if client else MAX_DEVICES
-    run = Readjustment(adjusted, change, entries, exterior=exterior, points=points, devices=devices)
-    size, whole = run.part_size(_PART), jax.tree.map(to_numpy, entries)
+    run = Readjustment(adjusted, change, entries, exterior=exterior, points=points)
+    size, whole = run.part_size(), jax.tree.map(to_numpy, entries)
     parts = [jax.tree.map(lambda v, k=k: v[k : k + size], whole) for k in range(0, _count(whole), size)]
-    found = dict(in_parts(run, enumerate(parts), client))
+    found = dict(in_parts(run, enumerate(parts), client, cores()))
     return join_draws([found[k] for k in range(len(parts))])
 
 
@@ -137,8 +133,7 @@ class DrawnChange(eqx.Module):
 class Readjustment:
     """Re-adjustment of a block with other values, compiled once; a study of `in_parts`. `seconds`: time of compilation.
 
-    `example` has the structure and length of the entries of `batches`; compilation is optimised for many draws. Results
-    on one and on several `devices`, at most the number given, differ by rounding.
+    `example` has the structure and length of the entries of `batches`; compilation is optimised for many draws.
     """
 
     def __init__(
@@ -149,7 +144,6 @@ class Readjustment:
         *,
         exterior: bool = False,
         points: bool = False,
-        devices: int = MAX_DEVICES,
     ):
         if not bool(adjusted.converged):
             raise InputError(f"draws need a converged adjustment, but the block is {adjusted.outcome.value}")
@@ -166,8 +160,6 @@ class Readjustment:
             adjusted.unknowns, *(np.ones(len(n), bool) for n in (adjusted.block.images, adjusted.block.points))
         )
         self.nominal = dataclasses.replace(adjusted.block, start=start, priors=adjusted.priors)
-        # With several processes, each one draws on its first device.
-        self.devices = usable(devices) if jax.process_count() == 1 else 1
         self.common = common_of(self.adjusted)
         self.names = self._varying_fields(self.first)
         self._values = jax.jit(jax.vmap(self._varying_values, out_axes=(-1, 0)))
@@ -175,11 +167,11 @@ class Readjustment:
     @property
     def batch_size(self) -> int:
         """Number of draws per batch."""
-        return self.devices * batch_size(self.adjusted.structure)
+        return batch_size(self.adjusted.structure)
 
-    def part_size(self, draws: int) -> int:
-        """Return the largest number of draws up to `draws` that fills batches; at least one batch."""
-        return self.batch_size * max(1, draws // self.batch_size)
+    def part_size(self, most: int = _PART) -> int:
+        """Return the number of draws per part: full batches, up to `most` draws, and a sufficient number of parts."""
+        return self.batch_size * max(1, min(most, self.count // _PARTS) // self.batch_size)
 
     def warm_up(self) -> None:
         """Compile the programs of `batches`."""
@@ -194,7 +186,7 @@ class Readjustment:
     def __reduce__(self):
         # Equinox' bound methods cannot be pickled.
         owner, method = getattr(self.change, "__self__", self.change), getattr(self.change, "__name__", "__call__")
-        arguments = self.adjusted, owner, method, self.first, self.count, self.exterior, self.points, self.devices
+        arguments = self.adjusted, owner, method, self.first, self.count, self.exterior, self.points
         return _readjustment, arguments
 
     def batches(self, entries: Any) -> Iterator[Draws]:
@@ -222,7 +214,7 @@ class Readjustment:
         padding = self.batch_size - _count(entries)
         entries = jax.tree.map(lambda v: np.concatenate([v, np.repeat(v[-1:], padding, axis=0)]), entries)
         varying, recorded = self._values(entries)
-        arguments = varying, self.common, self.devices, first_only
+        arguments = varying, self.common, first_only
         return call_compiled(find_optima, *arguments, thorough=self.many and not first_only), recorded
 
     def _fetch(self, optima: Found, recorded: Recorded, n: int) -> Draws:
@@ -304,11 +296,11 @@ class Readjustment:
         return tuple(varying)
 
 
-def _readjustment(adjusted, owner, method, first, count, exterior, points, devices) -> Readjustment:
+def _readjustment(adjusted, owner, method, first, count, exterior, points) -> Readjustment:
     """Return a `Readjustment` in another process."""
     change = owner if method == "__call__" or not hasattr(owner, method) else getattr(owner, method)
     example = jax.tree.map(lambda v: np.broadcast_to(v, (count, *v.shape[1:])), first)
-    return Readjustment(adjusted, change, example, exterior=exterior, points=points, devices=devices)
+    return Readjustment(adjusted, change, example, exterior=exterior, points=points)
 
 
 def common_of(adjusted: Adjustment, batch: int | None = None) -> Common:
