@@ -73,7 +73,7 @@ def in_parts(
         if client.status != "running":
             raise CommClosedError(f"the connection is {client.status}")
         count = max(1, _AHEAD * len(client.nthreads()) - len(numbers))
-        new = {client.submit(_compute, name, sent, part, pure=False): k for k, part in islice(waiting, count)}
+        new = {client.submit(_compute, name, sent, _pickled(p), pure=False): k for k, p in islice(waiting, count)}
         numbers.update(new)
         return list(new)
 
@@ -122,8 +122,8 @@ def _in_threads(study: Study, parts: Iterator[tuple[int, Any]], threads: int) ->
                 future.cancel()
 
 
-def _pickled(study: Study) -> bytes:
-    """Pickle a study; its functions that cannot be imported by name as code."""
+def _pickled(value: Any) -> bytes:
+    """Pickle a study or a part; functions that cannot be imported by name as code."""
     # Dask requires it.
     import cloudpickle
 
@@ -136,7 +136,7 @@ def _pickled(study: Study) -> bytes:
             return super().reducer_override(value)
 
     with io.BytesIO() as buffer:
-        Pickler(buffer).dump(study)
+        Pickler(buffer).dump(value)
         return buffer.getvalue()
 
 
@@ -144,7 +144,7 @@ _studies: dict[str, Study] = {}
 _one_at_a_time = Lock()
 
 
-def _compute(name: str, pickled: bytes, part: Any) -> Any:
+def _compute(name: str, pickled: bytes, part: bytes) -> Any:
     """Compute a part in a worker, which keeps the last study."""
     # A worker may have several threads.
     with _one_at_a_time:
@@ -152,7 +152,7 @@ def _compute(name: str, pickled: bytes, part: Any) -> Any:
             _studies.clear()
             _studies[name] = pickle.loads(pickled)
         study = _studies[name]
-    return study.compute(part)
+    return study.compute(pickle.loads(part))
 
 
 @contextmanager

@@ -2,10 +2,11 @@
 
 A design is a simulated block with observations and true points. Strips, overlap, heights, control, standard deviations
 and the numbers of images and points may differ between designs: blocks are padded to common sizes. The program runs
-over the designs with `jax.lax.map` on all devices and returns the statistics of each design. Normal matrices are not
-stored.
+over the designs with `jax.lax.map`, in threads or workers, and returns the statistics of each design. Normal matrices
+are not stored.
 """
 
+import hashlib
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from typing import Any, NamedTuple
@@ -14,7 +15,6 @@ import equinox as eqx
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.sharding import PartitionSpec as P
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxphoto.adjustment import (
@@ -37,15 +37,16 @@ from jaxphoto.adjustment.weak_directions import POOR, Yardsticks, image_yardstic
 from jaxphoto.arrays import ArrayLike
 from jaxphoto.block import Block
 from jaxphoto.compiling import run_compiled
-from jaxphoto.devices import AXIS, mesh_of, usable
+from jaxphoto.devices import cores
 from jaxphoto.errors import InputError, JaxphotoError
 from jaxphoto.initial.approximate import approximate
 from jaxphoto.statistics.covariance import EOP_NAMES, Rotations, physical_covariance
 from jaxphoto.statistics.determinability import corner_yardsticks, weakly_determined
 from jaxphoto.unknowns import Unknowns
+from jaxphoto.workers import in_parts
 
-# Number of designs per call of the program, at least one per device.
-_BATCH = 32
+BATCH = 8
+"""Number of designs per call of the program."""
 
 
 class CheckPoints(NamedTuple):
@@ -117,30 +118,28 @@ def group_by_program(designs: Sequence[PreparedDesign]) -> list[list[int]]:
     """Group the indices of designs by compiled program."""
     groups: dict[object, list[int]] = {}
     for k, design in enumerate(designs):
-        arrays, rest = eqx.partition((design.values, design.structure), eqx.is_array)
-        types = tuple((v.shape, v.dtype.str) for v in jax.tree.leaves(arrays))
-        key = (types, jax.tree.structure(arrays), tuple(jax.tree.leaves(rest)))
-        groups.setdefault(key, []).append(k)
+        groups.setdefault(_program(design), []).append(k)
     return list(groups.values())
+
+
+def _program(design: PreparedDesign) -> tuple:
+    """Return what determines the program of a design: types of arrays, and all other values."""
+    arrays, rest = eqx.partition((design.values, design.structure), eqx.is_array)
+    types = tuple((v.shape, v.dtype.str) for v in jax.tree.leaves(arrays))
+    return types, jax.tree.structure(arrays), tuple(jax.tree.leaves(rest))
 
 
 def evaluate(
     designs: Sequence[PreparedDesign], rotations: Rotations, max_steps: int, seconds: dict[str, float]
 ) -> DesignStatistics:
     """Compute the statistics of designs of one program, as NumPy arrays with a leading axis over the designs."""
-    devices = usable(_BATCH)
-    per_device = -(-_BATCH // devices)
-    size = per_device * devices
-    # Interleave the designs over the devices: a last batch of few designs then uses all devices.
-    order = np.arange(size).reshape(per_device, devices).T.ravel()
     parts = []
-    for begin in range(0, len(designs), size):
-        valid = begin + order < len(designs)
-        batch = [designs[k] for k in np.where(valid, begin + order, begin)]
+    for begin in range(0, len(designs), BATCH):
+        valid = begin + np.arange(BATCH) < len(designs)
+        batch = [designs[k] for k in np.where(valid, begin + np.arange(BATCH), begin)]
         arrays = jax.tree.map(lambda *v: np.stack(v), *((d.values, d.structure, d.check) for d in batch))
-        statistics = run_compiled(_evaluate, (*arrays, valid, devices, rotations, max_steps), seconds, "designs")
-        inverse = np.argsort(order)[: len(designs) - begin]
-        parts.append(jax.tree.map(lambda v: np.asarray(v)[inverse], statistics))  # noqa: B023
+        statistics = run_compiled(_evaluate, (*arrays, valid, rotations, max_steps), seconds, "designs")
+        parts.append(jax.tree.map(lambda v: np.asarray(v)[valid], statistics))  # noqa: B023
     return jax.tree.map(lambda *v: np.concatenate(v), *parts)
 
 
@@ -150,7 +149,6 @@ def _evaluate(
     s: PaddedStructure,
     check: CheckPoints,
     valid: Array,
-    devices: int,
     rotations: Rotations,
     max_steps: int,
 ) -> DesignStatistics:
@@ -162,16 +160,9 @@ def _evaluate(
         values, s, check = eqx.combine(arrays, rest)
         return _statistics(values, s, check, rotations, max_steps)
 
-    def evaluate_each(arrays, valid):
-        shapes = jax.eval_shape(evaluate_one, jax.tree.map(lambda v: v[0], arrays))
-        zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
-        return jax.lax.map(lambda d: jax.lax.cond(d[1], evaluate_one, lambda _: zeros, d[0]), (arrays, valid))
-
-    if devices == 1:
-        return evaluate_each(arrays, valid)
-    by_design: Any = P(AXIS)
-    run = jax.shard_map(evaluate_each, mesh=mesh_of(devices), in_specs=by_design, out_specs=by_design, check_vma=False)
-    return run(arrays, valid)
+    shapes = jax.eval_shape(evaluate_one, jax.tree.map(lambda v: v[0], arrays))
+    zeros = jax.tree.map(lambda v: jnp.zeros(v.shape, v.dtype), shapes)
+    return jax.lax.map(lambda d: jax.lax.cond(d[1], evaluate_one, lambda _: zeros, d[0]), (arrays, valid))
 
 
 def _statistics(
@@ -268,37 +259,86 @@ class Sweep(eqx.Module):
     programs: int = eqx.field(static=True)
     """Number of compiled programs."""
     seconds: dict[str, float] = eqx.field(static=True)
-    """Time (s) of prepare (approximate values, padding), compile (or load) and designs (computation)."""
+    """Time (s) of prepare (approximate values, padding), compile (or load) and designs (computation), summed over
+    threads or workers.
+    """
 
     def __len__(self) -> int:
         return len(self.parameters)
 
 
-def sweep(designs: Sequence[Design], rotations: Rotations = "omega_phi_kappa", *, max_steps: int = MAX_STEPS) -> Sweep:
+class _Evaluated(NamedTuple):
+    """Designs of one part: labels, redundancy, program and statistics of each, and the time spent (s)."""
+
+    labels: list[tuple[str, ...]]
+    redundancy: list[int]
+    program: list[str]
+    statistics: list[DesignStatistics]
+    seconds: dict[str, float]
+
+
+class _Evaluation(NamedTuple):
+    """Preparation and evaluation of designs; a study of `in_parts`."""
+
+    sizes: PaddedSizes
+    n_check: int
+    rotations: Rotations
+    max_steps: int
+
+    def compute(self, part: Sequence[tuple[int, Design]]) -> _Evaluated:
+        """Evaluate designs, with their numbers."""
+        began, prepared = time.perf_counter(), list[PreparedDesign]()
+        for k, design in part:
+            try:
+                prepared.append(prepare_design(design.block, design.truth, self.sizes, self.n_check))
+            except JaxphotoError as error:
+                raise type(error)(f"{_name(k, design)}: {error}") from error
+        seconds = {"prepare": time.perf_counter() - began}
+        statistics: dict[int, DesignStatistics] = {}
+        for group in group_by_program(prepared):
+            together = evaluate([prepared[k] for k in group], self.rotations, self.max_steps, seconds)
+            statistics |= {k: jax.tree.map(lambda v, n=n: v[n], together) for n, k in enumerate(group)}
+        labels, redundancy = [p.labels for p in prepared], [p.redundancy for p in prepared]
+        program = [hashlib.sha256(repr(_program(p)).encode()).hexdigest() for p in prepared]
+        return _Evaluated(labels, redundancy, program, [statistics[k] for k in range(len(part))], seconds)
+
+
+def sweep(
+    designs: Sequence[Design],
+    rotations: Rotations = "omega_phi_kappa",
+    *,
+    max_steps: int = MAX_STEPS,
+    client: Any = None,
+) -> Sweep:
     """Adjust and evaluate every design, with the results of `adjust`, `covariance` and `correlations`.
 
     `rotations` selects the rotations of the correlations (see `jaxphoto.covariance`). One program serves all designs
     with the same unknowns shared by images (cameras, mounts, strips with shifts) and the same kinds of observations;
     further programs are compiled as needed. A design that does not converge is not an error: see `Sweep.converged`.
+    `client`: a `dask.distributed.Client`, whose workers evaluate the designs (docs/cluster.md), with the same results.
 
     Raises InputError without designs, for parameter names or camera unknowns that differ between designs, and for a
     truth of another block. Raises the errors of `jaxphoto.adjust`, with the name of the design, for a design without
     datum, with an undetermined free unknown, or without approximate values.
     """
     _check(designs, rotations)
-    seconds: dict[str, float] = {}
-    prepared = _prepared(designs, seconds)
-    _check_cameras(designs, prepared)
-    groups = group_by_program(prepared)
-    labels = tuple(dict.fromkeys(label for design in prepared for label in design.labels))
-    parts = []
-    for group in groups:
-        same = [prepared[k] for k in group]
-        parts.append(_with_labels(evaluate(same, rotations, max_steps, seconds), same, labels))
-    order = np.argsort(np.concatenate(groups))
-    statistics = jax.tree.map(lambda *v: np.concatenate(v)[order], *parts)
-    redundancy = np.array([design.redundancy for design in prepared])
-    return _sweep(designs, statistics, redundancy, labels, rotations, len(groups), seconds)
+    n_check = max(len(np.unique(design.block.check.who)) for design in designs)
+    study = _Evaluation(common_sizes(design.block for design in designs), n_check, rotations, max_steps)
+    numbered = list(enumerate(designs))
+    parts = [numbered[first : first + BATCH] for first in range(0, len(designs), BATCH)]
+    found, seconds = {}, dict[str, float]()
+    for number, result in in_parts(study, enumerate(parts), client, cores()):
+        found[number] = result
+        for name, spent in result.seconds.items():
+            seconds[name] = seconds.get(name, 0.0) + spent
+    every = [found[k] for k in range(len(parts))]
+    labels_of = [labels for part in every for labels in part.labels]
+    _check_cameras(designs, labels_of)
+    labels = tuple(dict.fromkeys(label for of_design in labels_of for label in of_design))
+    statistics = _with_labels([one for part in every for one in part.statistics], labels_of, labels)
+    redundancy = np.array([n for part in every for n in part.redundancy])
+    programs = len({program for part in every for program in part.program})
+    return _sweep(designs, statistics, redundancy, labels, rotations, programs, seconds)
 
 
 def _check(designs: Sequence[Design], rotations: Rotations) -> None:
@@ -320,23 +360,9 @@ def _check(designs: Sequence[Design], rotations: Rotations) -> None:
             )
 
 
-def _prepared(designs: Sequence[Design], seconds: dict[str, float]) -> list[PreparedDesign]:
-    began = time.perf_counter()
-    sizes = common_sizes(design.block for design in designs)
-    n_check = max(len(np.unique(design.block.check.who)) for design in designs)
-    prepared = []
-    for k, design in enumerate(designs):
-        try:
-            prepared.append(prepare_design(design.block, design.truth, sizes, n_check))
-        except JaxphotoError as error:
-            raise type(error)(f"{_name(k, design)}: {error}") from error
-    seconds["prepare"] = time.perf_counter() - began
-    return prepared
-
-
-def _check_cameras(designs: Sequence[Design], prepared: Sequence[PreparedDesign]) -> None:
+def _check_cameras(designs: Sequence[Design], labels_of: Sequence[tuple[str, ...]]) -> None:
     """Raise InputError unless all designs have the same camera unknowns as the first."""
-    parameters = [[label for label in design.labels if label.startswith("interior[")] for design in prepared]
+    parameters = [[label for label in labels if label.startswith("interior[")] for labels in labels_of]
     for k, labels in enumerate(parameters):
         if labels != parameters[0]:
             raise InputError(
@@ -346,20 +372,18 @@ def _check_cameras(designs: Sequence[Design], prepared: Sequence[PreparedDesign]
 
 
 def _with_labels(
-    statistics: DesignStatistics, designs: Sequence[PreparedDesign], labels: tuple[str, ...]
+    statistics: Sequence[DesignStatistics], labels_of: Sequence[tuple[str, ...]], labels: tuple[str, ...]
 ) -> DesignStatistics:
-    """Expand the statistics to all `labels`; NaN for labels that a design lacks."""
-    n, q = len(designs), len(labels)
-    covariance, mean_abs, max_abs = (np.full((n, rows, q), np.nan) for rows in (q, 6, 6))
-    shared = np.full((n, q), np.nan)
-    for k, design in enumerate(designs):
-        # Designs of one program have equal shapes but may have different labels, such as names of strips.
-        index = np.array([labels.index(label) for label in design.labels], int)
-        covariance[k][np.ix_(index, index)] = statistics.covariance[k]
-        mean_abs[k][:, index], max_abs[k][:, index] = statistics.mean_abs[k], statistics.max_abs[k]
-        shared[k][index] = statistics.yards.shared[k]
-    yards = statistics.yards._replace(shared=shared)
-    return statistics._replace(covariance=covariance, mean_abs=mean_abs, max_abs=max_abs, yards=yards)
+    """Stack statistics expanded to all `labels`; NaN for labels that a design lacks."""
+    q, expanded = len(labels), list[DesignStatistics]()
+    for one, own in zip(statistics, labels_of, strict=True):
+        index = np.array([labels.index(label) for label in own], int)
+        covariance, mean_abs, max_abs, shared = (np.full((*rows, q), np.nan) for rows in ((q,), (6,), (6,), ()))
+        covariance[np.ix_(index, index)] = one.covariance
+        mean_abs[:, index], max_abs[:, index], shared[index] = one.mean_abs, one.max_abs, one.yards.shared
+        yards = one.yards._replace(shared=shared)
+        expanded.append(one._replace(covariance=covariance, mean_abs=mean_abs, max_abs=max_abs, yards=yards))
+    return jax.tree.map(lambda *v: np.stack(v), *expanded)
 
 
 def _sweep(
