@@ -159,8 +159,11 @@ def _compute(name: str, pickled: bytes, part: bytes) -> Any:
 def connected(workers: int | None, scheduler: str | None) -> Iterator["Client | None"]:
     """Yield a client of a new local cluster of `workers`, or of the scheduler at an address; None without both.
 
-    Raises InputError for an address that is neither encrypted (tls://) nor on this machine, and without a scheduler.
+    Raises InputError for both, for an address that is neither encrypted (tls://) nor on this machine, and without a
+    scheduler.
     """
+    if workers is not None and scheduler is not None:
+        raise InputError("--workers starts a scheduler of its own: omit it or --scheduler")
     if workers is None and scheduler is None:
         yield None
         return

@@ -233,8 +233,6 @@ def monte_carlo(
     from jaxphoto.workers import connected
 
     check_draws(draws)
-    if workers is not None and scheduler is not None:
-        raise typer.BadParameter("--workers starts its own scheduler: omit it or --scheduler.")
     if invalid := set(keep or ()) - {"exterior", "points"}:
         raise typer.BadParameter(f"--with {invalid.pop()}: choose from exterior, points.")
     if seed >= 2**63:
@@ -329,6 +327,8 @@ def halves(
     grid: opt.Grid = "15x11",
     extent: opt.Extent = None,
     camera: opt.Camera = None,
+    workers: opt.Workers = None,
+    scheduler: opt.Scheduler = None,
 ) -> None:
     """Assess the standard deviations of a calibration by random halves of its block.
 
@@ -339,15 +339,18 @@ def halves(
     from jaxphoto.procedures.compare import camera_of
     from jaxphoto.procedures.compare import halves as compare_halves
     from jaxphoto.report.stability import print_halves, write_halves
+    from jaxphoto.workers import connected
     from jaxphoto.writing import check_folder
 
     check_folder(out, block)
     with output.progress("reading the block") as progress:
         read, record = read_block(block), output.command_record(block)
         cells = opt.grid_points(read.sensors[camera_of(read, camera)], grid, extent)
-        result = compare_halves(
-            read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=method, report=progress.update
-        )
+        with connected(workers, scheduler) as client:
+            result = compare_halves(
+                read, cells, by=by, camera=camera, n_cuts=cuts, seed=seed, method=method, report=progress.update,
+                client=client,
+            )  # fmt: skip
         progress.update(f"writing {out}")
         name = result.camera
 

@@ -2,7 +2,7 @@
 
 import math
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 from typer import Argument, Option
 
@@ -115,40 +115,51 @@ def experiment(
     layouts: Annotated[
         int | None, Option(min=1, help="Number of simulated layouts (default: as in the experiment).")
     ] = None,
+    workers: opt.Workers = None,
+    scheduler: opt.Scheduler = None,
 ) -> None:
     """Run experiments; write tables.csv and report.html with the published values."""
-    from jaxphoto.experiment import compare, find_experiments, load_experiment, run_experiment, write_runs
-    from jaxphoto.experiment.page import agreement, far_apart, not_judged
+    from jaxphoto.experiment import find_experiments, load_experiment, run_experiment, write_runs
+    from jaxphoto.workers import connected
     from jaxphoto.writing import check_folder
 
     folders = find_experiments(experiments, name)
     check_folder(out, *folders)
     declared = {folder: load_experiment(folder) for folder in folders}
     runs, record = {}, {folder: output.command_record(folder) for folder in folders}
-    for folder, declaration in declared.items():
-        with output.progress(folder.name) as progress:
-            runs[folder] = run_experiment(declaration, folder, layouts, progress.update)
-        # Write after each experiment, so that results remain if a later one fails.
-        write_runs(runs, out, record)
-        comparison = compare(runs[folder], folder)
-        output.say(declaration.title, agreement(comparison))
-        rows, counts = list[tuple[str, ...]](), dict[str, tuple[int, int]]()
-        for of_table, cells in comparison.groupby("table", sort=False):
-            within, of = int((cells["within"] == "yes").sum()), int((cells["within"] != "").sum())
-            counts |= {str(of_table): (within, of)} if of else {}
-            unjudged, far = int(not_judged(cells)["values"].sum()), far_apart(cells)
-            outside = [f"{r.row} {r.column} ({r.ours:.4g}, {r.published:.4g})"
-                       for r in cells[cells["within"] == "no"].itertuples()]  # fmt: skip
-            ratios = [
-                f"{r['row']} {r['column']} ({r['ours']:.3g}, {r['published']:.3g}: x {r['ratio']:.2g}"
-                + ("" if math.isnan(r["expected"]) else f", expected {r['expected']:.3g}") + ")"
-                for r in far.to_dict("records")
-            ]  # fmt: skip
-            rows.append((str(of_table), str(within), str(of), str(unjudged), "; ".join([*outside, *ratios])))
-        headings = "table", "within", "judged", "not judged", "outside; twice or half without tolerance (ours, printed)"
-        output.table("values within tolerance", headings, iter(rows))
-        within_of, total = ({table: pair[k] for table, pair in counts.items()} for k in (0, 1))
-        output.add(**{folder.name: {"within": within_of, "of": total}})
-        for failure in runs[folder].failures:
-            output.warn(f"skipped: {failure}")
+    with connected(workers, scheduler) as client:
+        for folder, declaration in declared.items():
+            with output.progress(folder.name) as progress:
+                runs[folder] = run_experiment(declaration, folder, layouts, progress.update, client)
+            # Write after each experiment, so that results remain if a later one fails.
+            write_runs(runs, out, record)
+            _print_run(output, runs[folder], folder)
     output.wrote(out, f"results in {out} (open report.html)")
+
+
+def _print_run(output: Output, run: Any, folder: Path) -> None:
+    """Print the agreement of an experiment with the published values."""
+    from jaxphoto.experiment import compare
+    from jaxphoto.experiment.page import agreement, far_apart, not_judged
+
+    comparison = compare(run, folder)
+    output.say(run.experiment.title, agreement(comparison))
+    rows, counts = list[tuple[str, ...]](), dict[str, tuple[int, int]]()
+    for of_table, cells in comparison.groupby("table", sort=False):
+        within, of = int((cells["within"] == "yes").sum()), int((cells["within"] != "").sum())
+        counts |= {str(of_table): (within, of)} if of else {}
+        unjudged, far = int(not_judged(cells)["values"].sum()), far_apart(cells)
+        outside = [f"{r.row} {r.column} ({r.ours:.4g}, {r.published:.4g})"
+                   for r in cells[cells["within"] == "no"].itertuples()]  # fmt: skip
+        ratios = [
+            f"{r['row']} {r['column']} ({r['ours']:.3g}, {r['published']:.3g}: x {r['ratio']:.2g}"
+            + ("" if math.isnan(r["expected"]) else f", expected {r['expected']:.3g}") + ")"
+            for r in far.to_dict("records")
+        ]  # fmt: skip
+        rows.append((str(of_table), str(within), str(of), str(unjudged), "; ".join([*outside, *ratios])))
+    headings = "table", "within", "judged", "not judged", "outside; twice or half without tolerance (ours, printed)"
+    output.table("values within tolerance", headings, iter(rows))
+    within_of, total = ({table: pair[k] for table, pair in counts.items()} for k in (0, 1))
+    output.add(**{folder.name: {"within": within_of, "of": total}})
+    for failure in run.failures:
+        output.warn(f"skipped: {failure}")

@@ -4,9 +4,8 @@ import dataclasses
 import importlib.util
 import io
 from collections.abc import Callable, Iterator, Mapping
-from itertools import count
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import numpy as np
 import pandas as pd
@@ -20,6 +19,7 @@ from jaxphoto.io.toml import read_toml
 from jaxphoto.procedures.adjust import adjust
 from jaxphoto.report import Tables
 from jaxphoto.simulation import Recipe, Simulation, simulate
+from jaxphoto.workers import in_parts
 
 FILE = "experiment.py"
 Progress = Callable[[str], None]
@@ -97,17 +97,22 @@ class Run:
 
 
 def run_experiment(
-    experiment: Experiment, folder: Path, layouts: int | None = None, progress: Progress = lambda _: None
+    experiment: Experiment,
+    folder: Path,
+    layouts: int | None = None,
+    progress: Progress = lambda _: None,
+    client: Any = None,
 ) -> Run:
     """Run `experiment` with the recipes in `folder`. `progress` is called with a message for every step.
 
-    A layout in which a variant cannot be simulated or adjusted is rejected and listed in `failures`. Raises InputError
-    if all layouts are rejected, and for recipes that cannot be read.
+    `client`: a `dask.distributed.Client`, whose workers adjust the layouts after the first (docs/cluster.md). A layout
+    in which a variant cannot be simulated or adjusted is rejected and listed in `failures`. Raises InputError if all
+    layouts are rejected, and for recipes that cannot be read.
     """
     recipes = {name: _recipe(variant, folder) for name, variant in experiment.variants.items()}
     failures: list[str] = []
     simulations: dict[int, dict[str, Simulation]] = {}
-    wanted, counter = layouts or experiment.layouts, count(1)
+    wanted = layouts or experiment.layouts
     for layout in range(wanted):
         progress(f"simulating layout {layout + 1} of {wanted}")
         try:
@@ -115,29 +120,49 @@ def run_experiment(
         except (JaxphotoError, ValueError) as error:
             failures.append(f"layout {layout}: {error}")
     sizes = _sizes([{name: s.block for name, s in variants.items()} for variants in simulations.values()])
-    rows: list[tuple] = []
-    first: dict[str, Tables] = {}
+    study, first = _Layouts(experiment.tables, sizes), dict[str, Tables]()
+    found: dict[int, Any] = {}
     for layout, variants in simulations.items():
-        adjusted = {}
+        progress(f"adjusting layout 1 of {len(simulations)}")
+        first, *of_first = study.adjusted(variants)
+        found[layout] = tuple(of_first)
+        if first:
+            break
+    others = ((layout, variants) for layout, variants in simulations.items() if layout not in found)
+    for layout, result in in_parts(study, others, client):
+        found[layout] = result
+        progress(f"adjusting: layout {len(found)} of {len(simulations)}")
+    failures += [f"layout {layout}, {found[layout][1]}" for layout in simulations if found[layout][1]]
+    if not first:
+        raise InputError(f"{folder}: no layout could be adjusted; first error: {failures[0]}")
+    rows = [(*key, layout, value) for layout in simulations for *key, value in found[layout][0]]
+    cells = pd.DataFrame(rows, columns=["table", "row", "column", "layout", "value"])
+    return Run(experiment, cells, first, tuple(failures))
+
+
+class _Layouts(NamedTuple):
+    """Adjustment and evaluation of simulated layouts; a study of `in_parts`."""
+
+    tables: Mapping[str, Measure]
+    sizes: Mapping[str, PaddedSizes]
+
+    def compute(self, part: Mapping[str, Simulation]) -> tuple[list[tuple], str]:
+        """Return the cells (table, row, column, value) of a layout, and the reason if it is rejected."""
+        return self.adjusted(part)[1:]
+
+    def adjusted(self, variants: Mapping[str, Simulation]) -> tuple[dict[str, Tables], list[tuple], str]:
+        """Return the adjustments of all variants, and the result of `compute`; no adjustments if one fails."""
+        adjusted = dict[str, Tables]()
         try:
             for name, simulation in variants.items():
-                progress(f"adjusting: block {next(counter)} of {len(simulations) * len(variants)}")
-                adjusted[name] = Tables(adjust(simulation.block, sizes=sizes[name]))
+                adjusted[name] = Tables(adjust(simulation.block, sizes=self.sizes[name]))
                 if not bool(adjusted[name].adjusted.converged):
                     raise InputError(adjusted[name].adjusted.outcome.value)
         except JaxphotoError as error:
-            failures.append(f"layout {layout}, {name}: {error}")
-            continue
-        first = first or adjusted
-        rows += [
-            (table, row, column, layout, value)
-            for table, measure in experiment.tables.items()
-            for (row, column), value in measure(Results(adjusted, variants)).items()
-        ]
-    if not first:
-        raise InputError(f"{folder}: no layout could be adjusted; first error: {failures[0]}")
-    cells = pd.DataFrame(rows, columns=["table", "row", "column", "layout", "value"])
-    return Run(experiment, cells, first, tuple(failures))
+            return {}, [], f"{name}: {error}"
+        results = Results(adjusted, variants)
+        rows = [(table, *key, value) for table, of in self.tables.items() for key, value in of(results).items()]
+        return adjusted, rows, ""
 
 
 def simulated(experiment: Experiment, folder: Path, variant: str, layout: int = 0) -> Simulation:

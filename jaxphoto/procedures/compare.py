@@ -12,7 +12,7 @@ fixed points, cancel in every difference.
 
 import dataclasses
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 import scipy
@@ -44,6 +44,7 @@ from jaxphoto.stability import (
 from jaxphoto.statistics import VarianceComponents, common_covariance, covariance
 from jaxphoto.tracing import outside_transformations
 from jaxphoto.variants import some_images
+from jaxphoto.workers import in_parts
 
 
 @outside_transformations
@@ -159,6 +160,7 @@ def halves(
     seed: int = 0,
     method: Method = "rot",
     report: Callable[[str], None] = lambda said: None,
+    client: Any = None,
 ) -> Halves:
     """Adjust `block` and random halves of it, and compare `camera` at `cells_mm` (`image_grid`).
 
@@ -166,7 +168,8 @@ def halves(
 
     `by` is the unit that is never split: "image", "strip", or a partition of the block such as "day". `n_cuts` splits
     are drawn with `seed`, or all if fewer exist. `method` defines which systematic effects the orientation of the
-    images absorbs (`stability.alignment`).
+    images absorbs (`stability.alignment`). `client`: a `dask.distributed.Client`, whose workers adjust the halves
+    (docs/cluster.md).
 
     Raises InputError if the block cannot be split, no parameter of the camera is estimated or no two halves can be
     compared, and the errors of `adjust` for the whole block.
@@ -185,10 +188,12 @@ def halves(
     if not camera_covariance.any():
         raise InputError(f"no parameter of camera {name} is estimated; set some free")
     check_rays(interior, cells_mm, f"camera {name}")
-    done = []
-    for k, units in enumerate(first):
-        report(f"adjusting halves: split {k + 1} of {len(first)}")
-        done.append(halved(adjusted, units[_units(block, by)[1]], name, cells_mm, method, sizes))
+    study, unit, found = _Splits(adjusted, name, cells_mm, method, sizes), _units(block, by)[1], dict[int, Cut]()
+    report(f"adjusting halves: split 1 of {len(first)}")
+    for k, cut in in_parts(study, enumerate(units[unit] for units in first), client):
+        found[k] = cut
+        report(f"adjusting halves: split {min(len(found) + 1, len(first))} of {len(first)}")
+    done = [found[k] for k in range(len(first))]
     good = [k for k, cut in enumerate(done) if not cut.problem]
     if not good:
         raise InputError(f"no two halves of this block can be compared: {done[0].problem}")
@@ -263,6 +268,20 @@ def _balanced(units: int, rng: np.random.Generator) -> Bool[np.ndarray, "cuts un
     rows = scipy.linalg.hadamard(order)[rng.permutation(order)]
     tried = [rows[:, rng.permutation(order)[:units]] * rng.choice([-1, 1], units) for _ in range(_TRIES)]
     return max((cuts[np.abs(cuts.sum(axis=1)) <= units / 3] for cuts in tried), key=len) > 0
+
+
+class _Splits(NamedTuple):
+    """Adjustments of halves of the block of `adjusted`; a study of `in_parts`."""
+
+    adjusted: Adjustment
+    camera: str
+    cells_mm: np.ndarray
+    method: Method
+    sizes: PaddedSizes
+
+    def compute(self, part: np.ndarray) -> Cut:
+        """Compare the images `part` with the others."""
+        return halved(self.adjusted, part, *self[1:])
 
 
 def halved(
