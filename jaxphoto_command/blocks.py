@@ -213,7 +213,11 @@ def monte_carlo(
     sigma: Annotated[str | None, Option(help="Standard deviation of the interior parameter.")] = None,
     parameter: Annotated[str, Option(help="Interior parameter (c, k1 ...) of --bias interior.")] = "",
     on: Annotated[list[str] | None, Option(help="Only this strip, image, point ... (repeatable).")] = None,
-    draws: Annotated[int, Option(help="Number of draws.")] = 1000,
+    draws: Annotated[int, Option(help="Number of draws, at most with --precision-percent.")] = 1000,
+    precision_percent: Annotated[
+        float | None,
+        Option(min=0.0, help="Stop when the standard deviations of the estimates are known this precisely."),
+    ] = None,
     seed: opt.Seed = 0,
     keep: Annotated[
         list[str] | None, Option("--with", help="Also store exterior, or points with check points (repeatable).")
@@ -251,9 +255,10 @@ def monte_carlo(
         kept = {name: name in (keep or ()) for name in ("exterior", "points")}
         run = Readjustment(adjusted, drawn.applied, drawn_sigmas, **kept)
         warn_of_contradictions(adjusted, output)
-        study = MonteCarlo(read, run, drawn, draws, seed, out)
+        precision = None if precision_percent is None else precision_percent / 100
+        study = MonteCarlo(read, run, drawn, draws, seed, out, precision)
         with connected(workers, scheduler) as client:
-            study.draw(lambda done: progress.steps("draws", done, draws), client)
+            study.draw(lambda done: progress.steps("draws", done, draws, study.state), client)
         progress.update(f"writing {out}")
         summary, table = study.write()
         write_draws_page(summary, table, read.sensors, out, record)

@@ -39,11 +39,11 @@ class Progress:
         """Start a step of unknown length."""
         self._start(description, None)
 
-    def steps(self, description: str, done: int, total: int | None) -> None:
-        """Report that `done` of `total` steps are complete; rich estimates the remaining time."""
+    def steps(self, description: str, done: int, total: int | None, note: str = "") -> None:
+        """Report that `done` of `total` steps are complete, with a note; rich estimates the remaining time."""
         if description != self._description:
             self._start(description, total)
-        self._bar.update(self._task, completed=done)
+        self._bar.update(self._task, completed=done, description=f"{description}{note}")
 
     def _start(self, description: str, total: int | None) -> None:
         self._bar.remove_task(self._task)

@@ -4,7 +4,7 @@ import dataclasses
 import hashlib
 import json
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Generator
 from functools import cached_property
 from pathlib import Path
 from typing import Any
@@ -17,7 +17,7 @@ from jaxphoto.block import Block
 from jaxphoto.devices import cores
 from jaxphoto.io.draws_folder import DrawsFolder, digest_of
 from jaxphoto.io.text_files import read_json
-from jaxphoto.report.draws import draws_table, in_degrees, summary_table
+from jaxphoto.report.draws import LONG, draws_table, in_degrees, summary_table
 from jaxphoto.report.page import versions
 from jaxphoto.sensitivity import Bias, Readjustment
 from jaxphoto.workers import in_parts
@@ -27,6 +27,9 @@ from jaxphoto.writing import whole_file
 _PART, _PART_NUMBERS, _PART_ROWS = 1000, 5_000_000, 12_000_000
 # Number of columns of the draws that are read at a time.
 _AT_ONCE = 200
+# Number of draws from which the kurtosis of an estimate is known well enough for the uncertainty of its standard
+# deviation; fraction of the mean square below which a variance is rounding.
+_LEAST_DRAWS, _ROUNDING = 100, 1e-18
 # Columns of the draws that are not quantities.
 _OF_DRAWS = ("draw", "converged", "iterations", "fallback")
 # Maximum number of errors whose individual effects are predicted.
@@ -36,10 +39,21 @@ _PREDICTED = 20_000
 class MonteCarlo:
     """Draws of `drawn` in the folder `directory`; `run` applies given errors.
 
+    `precision`: relative precision of the standard deviations at which the run ends early.
+
     Raises InputError if the folder contains a different run or other files.
     """
 
-    def __init__(self, block: Block, run: Readjustment, drawn: Bias, draws: int, seed: int, directory: Path):
+    def __init__(
+        self,
+        block: Block,
+        run: Readjustment,
+        drawn: Bias,
+        draws: int,
+        seed: int,
+        directory: Path,
+        precision: float | None = None,
+    ):
         self.title, self.run, self.drawn, self.seed = block.title, run, drawn, seed
         self.keys = jax.jit(jax.vmap(lambda k: drawn.drawn(jax.random.fold_in(jax.random.key(seed), k))))
         widest = len(drawn.names) + len(draws_table(run.first_order(np.zeros((1, len(drawn.names)))), run.adjusted).T)
@@ -50,44 +64,70 @@ class MonteCarlo:
             # Identify the distribution, which has no name, by its first draws.
             "first_draws": _digest(np.asarray(self.keys(np.arange(4)))),
             "exterior": run.exterior, "points": run.points, "thorough": run.many,
-            "versions": versions(),
+            "precision": precision, "versions": versions(),
         }  # fmt: skip
         self.folder = DrawsFolder(directory, settings, draws, part)
-        self.computed, self.seconds = 0, 0.0
+        self.computed, self.seconds, self.precision = 0, 0.0, precision
+        # Sums of powers 0 to 4 of the differences of the estimates from the first draw.
+        self._first: np.ndarray | None = None
+        self._sums = np.zeros((5, 1))
 
     def draw(self, progress: Callable[[int], object] = lambda done: None, client: Any = None) -> None:
         """Draw the missing draws, on the workers of a `dask.distributed.Client` if given.
 
-        `progress` is called with the number of draws. Raises InputError if another process draws into the folder, and
-        the errors of `in_parts`.
+        `progress` is called with the number of draws. The run ends early if the relative `uncertainty` of the standard
+        deviations, from all parts up to some part, is at most `precision`. Raises InputError if another process draws
+        into the folder, and the errors of `in_parts`.
         """
-        folder = self.folder
-        with folder.alone():
-            if not folder.done:
-                missing = folder.missing_parts()
-                done = folder.draws - sum(map(self._size, missing))
-                if client is None:
-                    self.run.warm_up()
-                began = time.perf_counter()
-                for part, draws in in_parts(self.run, ((k, self._errors(k)) for k in missing), client, cores()):
-                    errors = zip(self.drawn.names, self._errors(part).T, strict=True) if self.drawn.recorded else ()
-                    draws = dataclasses.replace(draws, recorded=dict(errors))
-                    folder.write_part(part, draws_table(draws, self.run.adjusted, part * folder.per_part))
-                    self.computed += self._size(part)
-                    done += self._size(part)
-                    progress(done)
-                self.seconds = time.perf_counter() - began
-                folder.join()
-            folder.tidy()
+        self.folder.fill(lambda missing: self._parts(missing, client), progress, self._precise)
 
-    def _size(self, part: int) -> int:
-        """Return the number of draws of a part."""
-        return min(self.folder.per_part, self.folder.draws - part * self.folder.per_part)
+    def _parts(self, missing: list[int], client: Any) -> Generator[tuple[int, pd.DataFrame], None, None]:
+        if client is None:
+            self.run.warm_up()
+        began = time.perf_counter()
+        for part, draws in in_parts(self.run, ((k, self._errors(k)) for k in missing), client, cores()):
+            errors = zip(self.drawn.names, self._errors(part).T, strict=True) if self.drawn.recorded else ()
+            draws = dataclasses.replace(draws, recorded=dict(errors))
+            self.computed += len(draws.steps)
+            self.seconds = time.perf_counter() - began
+            yield part, draws_table(draws, self.run.adjusted, part * self.folder.per_part)
+
+    def _precise(self, table: pd.DataFrame) -> bool:
+        """Add the moments of a part. Return True if the standard deviations have the precision requested."""
+        names = [name for name in table.columns if name not in _OF_DRAWS and not name.startswith((*LONG, "bias."))]
+        values = table.loc[table["converged"], names].to_numpy(float)
+        if len(values):
+            # Differences from the first draw keep the digits of their powers.
+            self._first = values[0] if self._first is None else self._first
+            self._sums = self._sums + [((values - self._first) ** power).sum(axis=0) for power in range(5)]
+        return self.precision is not None and self.uncertainty <= self.precision
+
+    @property
+    def uncertainty(self) -> float:
+        """Largest standard deviation of a standard deviation of an estimate, relative to it.
+
+        sqrt((kurtosis - 1) / 4 n) for n draws; infinite for few draws.
+        """
+        n, *sums = self._sums
+        if n[0] < _LEAST_DRAWS:
+            return np.inf
+        m1, m2, m3, m4 = (each / n for each in sums)
+        variance = m2 - m1**2
+        fourth = m4 - 4 * m1 * m3 + 6 * m1**2 * m2 - 3 * m1**4
+        changes = variance > _ROUNDING * (m1**2 + m2)
+        kurtosis = fourth[changes] / variance[changes] ** 2
+        return float(np.sqrt(np.maximum(kurtosis - 1, 0.0) / (4 * n[changes])).max(initial=0.0))
+
+    @property
+    def state(self) -> str:
+        """Rate of the run and uncertainty of the standard deviations, in words."""
+        known = f", standard deviations +- {100 * self.uncertainty:.2g} %" if self.uncertainty < 1 else ""
+        return f" ({self.computed / self.seconds:.0f} per second{known})"
 
     def _errors(self, part: int) -> np.ndarray:
         """Draw the errors of a part. All parts have the same length here, so one program is compiled."""
         errors = np.asarray(self.keys(part * self.folder.per_part + np.arange(self.folder.per_part)))
-        return errors[: self._size(part)]
+        return errors[: self.folder.size(part)]
 
     def write(self) -> tuple[dict, pd.DataFrame]:
         """Write summary.csv, effects.csv and, last, summary.json; return the summary and its table.

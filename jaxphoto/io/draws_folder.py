@@ -1,13 +1,13 @@
-"""Monte Carlo draws on disk: Parquet parts during a run, then one file.
+"""Results of a study on disk, a row per draw: Parquet parts during a run, then one file.
 
-Parts are written atomically. Parts may be written in any order. An interrupted run resumes with
-the missing parts and yields an identical file.
+Parts are written atomically and in any order. An interrupted run resumes with the missing parts and yields an identical
+file.
 """
 
 import contextlib
 import hashlib
 import json
-from collections.abc import Iterator
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
 from pathlib import Path
 
@@ -82,6 +82,51 @@ class DrawsFolder:
                 raise InputError(f"another run is drawing into {self.directory}: wait for it, or use a new folder")
             yield
 
+    def fill(
+        self,
+        compute: Callable[[list[int]], Generator[tuple[int, pd.DataFrame], None, None]],
+        progress: Callable[[int], object] = lambda done: None,
+        enough: Callable[[pd.DataFrame], bool] = lambda table: False,
+    ) -> None:
+        """Write the missing parts, which `compute` yields in any order with their numbers, and join all.
+
+        `progress` is called with the number of draws. `enough` is called with the parts in their order; after the first
+        for which it is True, the run ends. Raises InputError if another process draws into the folder.
+        """
+        with self.alone():
+            if not self.done:
+                missing = self.missing_parts()
+                with contextlib.closing(compute(missing)) as parts:
+                    self._write(parts, missing, progress, enough)
+                self.join()
+            self.tidy()
+
+    def _write(self, parts: Iterator, missing: list[int], progress: Callable, enough: Callable) -> None:
+        waiting: dict[int, pd.DataFrame | None] = dict.fromkeys(set(range(self.n_parts)) - set(missing))
+        done, following = self.draws - sum(map(self.size, missing)), 0
+        while True:
+            while following in waiting:
+                table = waiting.pop(following)
+                following += 1
+                if enough(self._read_part(following - 1) if table is None else table):
+                    self.draws = min(self.draws, following * self.per_part)
+                    return
+            if (new := next(parts, None)) is None:
+                return
+            part = new[0]
+            waiting[part] = new[1]
+            self.write_part(*new)
+            done += self.size(part)
+            progress(done)
+
+    def size(self, part: int) -> int:
+        """Return the number of draws of a part."""
+        return min(self.per_part, self.draws - part * self.per_part)
+
+    def _read_part(self, k: int) -> pd.DataFrame:
+        with _reading(self._part(k)):
+            return pq.read_table(self._part(k), page_checksum_verification=True).to_pandas()
+
     def write_part(self, k: int, table: pd.DataFrame) -> None:
         """Write the draws of part `k`."""
         with whole_file(self._part(k)) as work:
@@ -104,8 +149,8 @@ class DrawsFolder:
 
     def tidy(self) -> None:
         """Remove the parts after joining."""
-        for k in range(self.n_parts):
-            self._part(k).unlink(missing_ok=True)
+        for part in (self.directory / _PARTS).glob("part-*.parquet"):
+            part.unlink()
         clear_leftovers(self.directory / _PARTS)
         with contextlib.suppress(OSError):
             (self.directory / _PARTS).rmdir()

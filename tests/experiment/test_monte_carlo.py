@@ -26,11 +26,11 @@ from tests.marks import slow_but
 NOMINAL = "strips"
 
 
-def study(directory, draws=1100, seed=1, errors=None) -> MonteCarlo:
+def study(directory, draws=1100, seed=1, errors=None, precision=None) -> MonteCarlo:
     nominal = adjusted("cross")
     errors = bias(nominal.block, "station", 0.1, "block") if errors is None else errors
     run = Readjustment(nominal, errors.applied, errors.sigma[None])
-    return MonteCarlo(nominal.block, run, errors, draws, seed, directory)
+    return MonteCarlo(nominal.block, run, errors, draws, seed, directory, precision)
 
 
 @pytest.fixture(scope="module")
@@ -259,3 +259,23 @@ def test_a_killed_run_continues_to_the_same_file(folder, tmp_path):
     subprocess.run([*program, "--out", str(tmp_path / "killed")], check=True, capture_output=True)
     for name in ("draws.parquet", "summary.csv"):
         assert (tmp_path / "killed" / name).read_bytes() == (tmp_path / "whole" / name).read_bytes()
+
+
+def test_a_run_ends_when_the_standard_deviations_are_precise(tmp_path):
+    """The uncertainty of a standard deviation is that of repeated samples; where the run ends depends on draws alone."""
+    ends = []
+    for k, early in enumerate(([], [3, 1])):
+        made = study(tmp_path / str(k), draws=4000, precision=0.04)
+        # A run whose parts were written in another order ends at the same draw.
+        for part, table in made._parts(early, None):
+            made.folder.write_part(part, table)
+        made.draw()
+        ends.append(pd.read_parquet(tmp_path / str(k) / "draws.parquet"))
+    assert ends[0].equals(ends[1])
+    n = len(ends[0])
+    assert 200 < n < 1000
+    estimates = ends[0][[c for c in ends[0] if c.startswith("one.")]]
+    resampled = [estimates.sample(n, replace=True, random_state=k).std() for k in range(300)]
+    scatter = (pd.DataFrame(resampled).std() / estimates.std()).max()
+    assert made.uncertainty <= 0.04
+    assert made.uncertainty == pytest.approx(scatter, rel=0.25)
