@@ -4,6 +4,7 @@ import math
 from pathlib import Path
 from typing import Annotated, Any
 
+import typer
 from typer import Argument, Option
 
 from jaxphoto_command import options as opt
@@ -78,6 +79,11 @@ def simulate(
     recipe: Annotated[Path, Argument(help="Recipe in TOML (docs/simulation.md).")],
     out: opt.BlockOut,
     seed: opt.Seed = 0,
+    repeat: Annotated[
+        int | None, Option(min=1, help="Simulate and adjust this number of flights; write errors and sigmas instead.")
+    ] = None,
+    workers: opt.Workers = None,
+    scheduler: opt.Scheduler = None,
 ) -> None:
     """Simulate a block with known true parameters."""
     from jaxphoto.io import read_recipe, write_simulation
@@ -85,6 +91,10 @@ def simulate(
     from jaxphoto.simulation import simulate
     from jaxphoto.writing import check_folder
 
+    if repeat is not None:
+        return _repeat(output, recipe, out, seed, repeat, workers, scheduler)
+    if workers is not None or scheduler is not None:
+        raise typer.BadParameter("--workers and --scheduler need --repeat.")
     check_folder(out, recipe)
     with output.progress("simulating") as progress:
         simulation = simulate(read_recipe(recipe), seed)
@@ -104,6 +114,31 @@ def simulate(
         f"points{scan} (seed {seed}); the truth is in {out / 'truth'}",
     )
     output.add(**counts, seed=seed)
+    return None
+
+
+def _repeat(
+    output: Output, recipe: Path, out: Path, seed: int, repeat: int, workers: int | None, scheduler: str | None
+) -> None:
+    """Simulate and adjust many flights."""
+    from jaxphoto.experiment.simulated_flights import flights_verdict, simulate_flights, write_flights_page
+    from jaxphoto.io import read_recipe
+    from jaxphoto.io.draws_folder import check_place
+    from jaxphoto.report.formatting import path_words, to_rich
+    from jaxphoto.workers import connected
+
+    check_place(out)
+    read, record = read_recipe(recipe), output.command_record(recipe)
+    with output.progress("simulating") as progress:
+        told = lambda done: progress.steps("flights", done, repeat)  # noqa: E731
+        with connected(workers, scheduler) as client:
+            summary, table = simulate_flights(read, repeat, seed, out, told, client)
+        write_flights_page(summary, table, out, record)
+    output.say(flights_verdict(summary, table))
+    shown = table.assign(parameter=[path_words(name).partition(" [")[0] for name in table["parameter"]])
+    columns = ["parameter", "mean_error", "rms_error", "rms_sigma", "inside_percent", "unit"]
+    output.screen.print(to_rich(shown[columns], "errors of the estimates"))
+    output.wrote(out, f"results in {out} (open report.html)")
 
 
 @command("experiment", PANEL, "jaxphoto example experiments && jaxphoto experiment 000 --layouts 4 --out runs")
