@@ -6,6 +6,7 @@ so the machines need no common file system. Results do not depend on the number 
 """
 
 import io
+import logging
 import os
 import pickle
 from collections.abc import Iterable, Iterator
@@ -188,12 +189,12 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator["Client | 
         return
     count = workers or 1
     deaths = {"distributed.scheduler.allowed-failures": _DEATHS, "distributed.worker.memory.terminate": False}
-    pin = _PIN.format(workers=count)
+    environment = _ENVIRONMENT | {"JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu")}
     with (
         dask.config.set(deaths),
         LocalCluster(
             n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0", memory_limit=0,
-            preload=[pin], env=_ENVIRONMENT | {"JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu")},
+            silence_logs=logging.ERROR, preload=[_PIN.format(workers=count)], env=environment,
         ) as cluster,
         Client(cluster) as client,
     ):  # fmt: skip

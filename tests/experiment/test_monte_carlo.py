@@ -262,7 +262,7 @@ def test_a_killed_run_continues_to_the_same_file(folder, tmp_path):
 
 
 def test_a_run_ends_when_the_standard_deviations_are_precise(tmp_path):
-    """The uncertainty of a standard deviation is that of repeated samples; where the run ends depends on draws alone."""
+    """The uncertainty of a standard deviation is that of resampling; where the run ends depends on the draws alone."""
     ends = []
     for k, early in enumerate(([], [3, 1])):
         made = study(tmp_path / str(k), draws=4000, precision=0.04)

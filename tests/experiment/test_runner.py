@@ -1,5 +1,8 @@
 """Experiments run as declared, and results are written completely."""
 
+import subprocess
+import sys
+
 import numpy as np
 import pandas as pd
 import pytest
@@ -96,6 +99,17 @@ def test_cells_are_those_of_each_layout_adjusted_by_itself(folder, run):
         assert cells["check", "full", "n_check_points"] == 4
     assert not run.failures
     assert set(run.first) == {"full", "vertical", "longer"}
+
+
+@pytest.mark.slow
+def test_workers_give_the_same_cells(folder, run, tmp_path):
+    pytest.importorskip("distributed", reason="distributed is not installed (extra cluster)")
+    # Functions wrapped by the type checks of this process cannot be sent to another.
+    command = "import sys; from jaxphoto_command import main; sys.exit(main())"
+    options = ["--experiments", folder.parent, "--layouts", "2", "--workers", "1", "--out", tmp_path / "runs"]
+    subprocess.run([sys.executable, "-c", command, "experiment", "small", *map(str, options)], check=True)
+    again = pd.read_csv(tmp_path / "runs" / "cells.csv", dtype={"row": str})
+    pd.testing.assert_frame_equal(again[run.cells.columns], run.cells, rtol=1e-9, check_dtype=False)
 
 
 def test_a_variant_replaces_what_it_names_in_the_recipe_and_nothing_else(run):

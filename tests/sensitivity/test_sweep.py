@@ -21,6 +21,7 @@ from jaxphoto.report.verdict import verdict_of
 from jaxphoto.sensitivity import sweep as side_by_side
 from jaxphoto.sensitivity.sweep import Design, Sweep, sweep
 from jaxphoto.statistics import correlations
+from jaxphoto.workers import connected
 from tests.checked_types import unchecked
 from tests.simulation.small import SMALL, made
 
@@ -75,6 +76,16 @@ def designs() -> list[Design]:
 @pytest.fixture(scope="module")
 def swept(designs: list[Design]) -> Sweep:
     return sweep(designs)
+
+
+@pytest.mark.slow
+def test_workers_give_the_same_statistics(designs, swept):
+    pytest.importorskip("distributed", reason="distributed is not installed (extra cluster)")
+    with connected(1, None) as client:
+        again = sweep(designs, client=client)
+    for name in ("converged", "steps", "redundancy", "sigma0", "sigma", "correlation", "mean_abs", "check_rmse"):
+        np.testing.assert_array_equal(getattr(again, name), getattr(swept, name))
+    assert (again.labels, again.weak, again.programs) == (swept.labels, swept.weak, swept.programs)
 
 
 @pytest.fixture(scope="module")
