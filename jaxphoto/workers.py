@@ -63,11 +63,13 @@ def in_parts(
         yield from _in_threads(study, iter(parts), threads)
         return
     with extra():
+        import dask
         from distributed import KilledWorker, as_completed
         from distributed.comm import CommClosedError
     waiting, name, numbers = iter(parts), uuid4().hex, dict[Any, int]()
     # As the result of a task, unlike scattered data, the study survives the death of the worker that holds it.
-    sent = client.submit(bytes, _pickled(study), key=f"study-{name}", pure=False)
+    with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TB"}):
+        sent = client.submit(bytes, _pickled(study), key=f"study-{name}", pure=False)
 
     def submit() -> list[Any]:
         """Submit parts up to the number that the present workers need."""

@@ -24,7 +24,7 @@ from jaxphoto.workers import in_parts
 from jaxphoto.writing import whole_file
 
 # Maximum size of a part in draws, components and image rows: an interrupted run loses one part (some seconds).
-_PART, _PART_NUMBERS, _PART_ROWS = 1000, 5_000_000, 12_000_000
+_PART, _PART_NUMBERS, _PART_ROWS = 4000, 5_000_000, 12_000_000
 # Number of columns of the draws that are read at a time.
 _AT_ONCE = 200
 # Number of draws from which the kurtosis of an estimate is known well enough for the uncertainty of its standard
