@@ -517,7 +517,9 @@ def _estimated_weights(components: statistics.VarianceComponents, stated: Tables
     if path := next((label for label in labels if label.endswith(".c_mm")), ""):
         new, old = (float(t.covariance.shared_sigma[labels.index(path)]) for t in (estimated, stated))
         effect = f"; sigma of {path} {new:.2g} mm instead of {old:.2g} mm"
-    subject = few([f"{label.replace('_', ' ')} {f:.3g}" for label, f in factors.items()])
+    # sigma of the factor of the variance, 2 sqrt(factor) times that of its root.
+    sigma = dict(zip(components.labels, (components.sigma / np.sqrt(components.factor) / 2).tolist(), strict=True))
+    subject = few([f"{label.replace('_', ' ')} {plus_minus(f, sigma[label])}" for label, f in factors.items()])
     severity: Severity = "note" if usual else "warning"
     return Finding("weights", severity, subject, factors[worst], 1.0, numbers={"effect": effect})
 
