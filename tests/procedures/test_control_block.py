@@ -3,10 +3,12 @@
 import dataclasses
 import re
 
+import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto import adjust
+from jaxphoto import FIXED, adjust
+from jaxphoto.block import Datum
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.observations import CameraPositions
@@ -16,8 +18,8 @@ from jaxphoto.procedures.control.marks import TURNED, intersected, turned_marks,
 from jaxphoto.procedures.control.marks import marked as marked_rows
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from jaxphoto.simulation import image_coordinates
-from tests.blocks import free_network, simulated
-from tests.procedures.controlled import CHECK, CODE, CONTROL, ORIGIN, marked_block
+from tests.blocks import calibration_flight, free_network, simulated
+from tests.procedures.controlled import CHECK, CODE, CONTROL, ORIGIN, marked_block, surveyed_and_without
 
 
 @pytest.fixture(scope="module")
@@ -131,6 +133,24 @@ def test_a_blunder_that_the_places_hide_is_found_by_the_adjustment(marked):
     # It checks nothing either; and of check points nobody has said how well they were surveyed.
     check = found.adjusted.block.check
     assert len(check) == 3 * len(CHECK) and not np.asarray(check.sigma).any()
+
+
+@pytest.mark.parametrize("wrong", [("T1", "T2"), ("T2", "T3"), ("T5", "T7")])
+def test_two_wrong_heights_of_eight_are_named(wrong):
+    """25 m, which a tilt of the block brings within its tolerance for one of the two."""
+    block, truth, *_ = calibration_flight()
+    given, rest = surveyed_and_without(block)
+    empty = {name: rest.named_observations[name].take(np.zeros(0, int)) for name in ("stations", "attitudes")}
+    mount = lambda b: b.priors.mounts["default"].boresight  # noqa: E731
+    free = dataclasses.replace(eqx.tree_at(mount, rest.with_observations(empty), FIXED), datum=Datum("inner"))
+    xyz = given.points.coordinates.copy()
+    xyz[[given.points.ids.index(name) for name in wrong], 2] += 25.0
+    found = control_block(at_optimum(adjust(free)), with_coordinates(given, xyz))
+    assert {name for name, state in zip(found.ids, found.state, strict=True) if state == "left out"} == set(wrong)
+    off = dict(zip(found.ids, found.off_m, strict=True))
+    assert all(off[name][2] == pytest.approx(25.0, abs=0.5) for name in wrong)
+    c = found.adjusted.unknowns.interior["phase"].c
+    assert float(c) == pytest.approx(float(truth.interior["phase"].c), abs=0.1)
 
 
 def test_heights_that_nobody_surveyed_cost_a_sentence(marked):
