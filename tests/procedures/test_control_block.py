@@ -14,7 +14,7 @@ from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.observations import CameraPositions
 from jaxphoto.procedures.control import GivenControl, Marks, at_optimum, control_block
 from jaxphoto.procedures.control.control_block import check_handedness, check_units, onto_control
-from jaxphoto.procedures.control.marks import TURNED, intersected, turned_marks, without_names
+from jaxphoto.procedures.control.marks import TURNED, are_undistorted, intersected, turned_marks, without_names
 from jaxphoto.procedures.control.marks import marked as marked_rows
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from jaxphoto.simulation import image_coordinates
@@ -236,6 +236,20 @@ def test_marks_by_another_convention_are_named_by_the_one_that_restores_them(mar
     np.testing.assert_allclose(restored, control.marks.column_row[inside], atol=1e-6)
     true, _ = marked_rows(marked.block, control.points, control.marks)
     assert turned_marks(marked.block, start, true, np.ones(len(true.image), bool)) is None
+
+
+def test_marks_of_undistorted_pictures_are_refused(marked):
+    control, sensor = marked.control, marked.block.sensors["one"]
+    interior = marked.block.start.unknowns.interior["one"]
+    xy = sensor.mm_from_px(control.marks.column_row)
+    ideal = np.array([interior.ideal_from_measured(p) for p in xy]) + np.asarray(interior.principal_point)
+    undistorted = control.marks._replace(column_row=sensor.px_from_mm(ideal))
+    start = marked.block.start.unknowns
+    for marks, expected in ((control.marks, False), (undistorted, True)):
+        rows, _ = marked_rows(marked.block, control.points, marks)
+        assert are_undistorted(marked.block, start, rows) is expected
+    with pytest.raises(InputError, match="undistorted"):
+        found_in(marked, control._replace(marks=undistorted))
 
 
 @pytest.mark.parametrize("axis", [0, 2])

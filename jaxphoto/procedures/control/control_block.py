@@ -31,6 +31,7 @@ from jaxphoto.georeferencing.map_frame import MapFrame, check_area, check_height
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.marks import (
     Marked,
+    are_undistorted,
     factor_of_marks,
     intersected,
     into_block,
@@ -442,6 +443,11 @@ def control_block(
             f"{factor:.3g}: they were measured in pictures of about {sensor.width_px / factor:.0f} x "
             f"{sensor.height_px / factor:.0f} px, the camera has {sensor.width_px} x {sensor.height_px} px. Multiply "
             "them, or mark the photographs in full size"
+        )
+    if are_undistorted(block, block.start.unknowns, rows):
+        raise InputError(
+            f"{points.file}: the rays of the marks intersect far better without the distortion of the camera, as if "
+            "measured in undistorted pictures: measure them in the original pictures"
         )
     rows, messages = rows.take(met.good), [*messages, *met.sentences]
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)
