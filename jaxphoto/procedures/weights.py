@@ -23,6 +23,7 @@ from jaxphoto.adjustment import MAX_STEPS, Adjustment
 from jaxphoto.adjustment.model.numbers import IMAGE_POINTS
 from jaxphoto.errors import few
 from jaxphoto.statistics import (
+    LEAST_CHECKED,
     LEVEL,
     EffectTest,
     Parts,
@@ -32,6 +33,7 @@ from jaxphoto.statistics import (
     covariance,
     normalised_residuals,
     observation_groups,
+    p_value_of_excess,
     part_factors,
     partition_observations,
     redundancy_numbers,
@@ -47,6 +49,8 @@ _RATIO = 1.1
 # Ratio of the mean and the median square of normalised residuals, both as estimates of their variance, above which a
 # few blunders explain a large mean. Median of chi-square with one degree of freedom.
 _FEW, _MEDIAN = 4.0, 0.455
+# Number of observations of a part up to which a test by eigenvalues is affordable; more have power without them.
+_SMALL = 300
 # Ratio of sigmas of image points above which weights are no sufficient explanation (docs/trust.md).
 _FITS = 3.0
 
@@ -97,9 +101,19 @@ def _contradictions(adjusted: Adjustment, parts: Parts, redundancy: Redundancy) 
     """Return the parts whose variance factor differs from its expectation, most significant first."""
     factors = part_factors(adjusted, parts, redundancy)
     level = LEVEL / max(len(factors), 1)
-    different = [f for f in factors if f.p_value < level and not 1 / _RATIO < f.sigma < _RATIO]
+    different = [
+        f for f in factors if not 1 / _RATIO < f.sigma < _RATIO and _p_value(adjusted, parts, f, level) < level
+    ]
     # The logarithm of a variance factor has the standard deviation sqrt(2 / redundancy); p-values underflow.
     return sorted(different, key=lambda f: -abs(np.log(f.sigma)) * f.redundancy**0.5)
+
+
+def _p_value(adjusted: Adjustment, parts: Parts, factor: VarianceFactor, level: float) -> float:
+    """Return the p-value of a factor; a large one of a small part is tested with the eigenvalues of its R."""
+    small = factor.n <= _SMALL and not factor.group.startswith(IMAGE_POINTS)
+    if factor.p_value < level or factor.sigma < 1 or not small:
+        return factor.p_value
+    return p_value_of_excess(adjusted, parts, factor)
 
 
 def _has_another_cause(
@@ -122,11 +136,16 @@ def _has_another_cause(
         p = beta_tail(min(e.explained / squares, 1.0), e.freedom / 2, (freedom - e.freedom) / 2)
         if p < LEVEL / len(effects):
             return True
-    w = normalised_residuals(adjusted, redundancy)
     for label in labels:
         k = parts.labels.index(label)
+        # Far too small standard deviations leave residuals only at the observations with the largest redundancy.
+        numbers = [np.asarray(redundancy[name])[part == k] for name, part in parts.part_of.items()]
+        seen, of_seen = adjusted, redundancy
+        if np.median(np.concatenate(numbers)) < LEAST_CHECKED:
+            seen, of_seen = trial.adjusted, redundancy_numbers(trial.adjusted, covariance(trial.adjusted, rows=True))
+        w = normalised_residuals(seen, of_seen)
         of_part = np.concatenate([np.abs(w[name][part == k]) for name, part in parts.part_of.items()])
-        squares = (float(adjusted.sigma0) * of_part[np.isfinite(of_part)]) ** 2
+        squares = (float(seen.sigma0) * of_part[np.isfinite(of_part)]) ** 2
         if not len(squares) or squares.mean() > _FEW * np.median(squares) / _MEDIAN:
             return True
     return False

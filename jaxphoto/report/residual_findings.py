@@ -257,7 +257,8 @@ def _systematic(tables: Tables, fits: bool, sizes: statistics.ErrorSizes | None 
     level = statistics.LEVEL / max(len(tables.tested_trends), 1)
     tests = _with_sizes(tables, sizes, level) if sizes else tables.tested_trends
     found = (t for t in tests if t.p_value < level and (fits or not t.pattern.camera))
-    for t in sorted(found, key=lambda t: t.p_value ** (_SIMILAR if t.pattern.begins else 1.0)):
+    # If p-values underflow, the effect that explains most is first.
+    for t in sorted(found, key=lambda t: (t.p_value ** (_SIMILAR if t.pattern.begins else 1.0), -t.explained)):
         factor, unit = in_file_unit(t.pattern.unit)
         detail, likely, spoilt = "", list[statistics.TermEstimate](), False
         if t.size > 0 and unit:

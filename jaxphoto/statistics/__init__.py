@@ -35,6 +35,7 @@ from jaxphoto.statistics.global_test import (
     expected_residual_scale,
     global_test,
     group_factors,
+    p_value_of_excess,
     part_factors,
 )
 from jaxphoto.statistics.hat_matrix import prepare_hat_matrix
@@ -98,7 +99,8 @@ __all__ = [
     "correlation_matrix", "correlations", "covariance", "critical_w", "error_sizes", "expected_residual_scale",
     "fix_at_zero", "global_test", "ground_correlations", "group_factors", "largest_interior_effects",
     "largest_mdbs", "linear_forms", "mdb_effects", "minimal_detectable_biases", "multiple_outlier_test",
-    "normalised_residuals", "observation_groups", "part_factors", "partial_redundancy", "partition_observations",
-    "physical_residuals", "point_differences", "prepare_hat_matrix", "prepare_statistics", "redundancy_numbers",
-    "residual_spread", "significance", "strip_differences", "systematic_effect_tests", "variance_components",
+    "normalised_residuals", "observation_groups", "p_value_of_excess", "part_factors", "partial_redundancy",
+    "partition_observations", "physical_residuals", "point_differences", "prepare_hat_matrix", "prepare_statistics",
+    "redundancy_numbers", "residual_spread", "significance", "strip_differences", "systematic_effect_tests",
+    "variance_components",
 ]  # fmt: skip

@@ -5,6 +5,11 @@ mean nu_g, the sum of its redundancy numbers (Förstner 1979). Its variance is a
 nu_g degrees of freedom, so the group test is conservative. If nu_g is below 1 (a group with far too large weights),
 v'Pv / nu_g exceeds a value above 1.54 at most with the probability of chi-square with one degree of freedom (Székely
 and Bakirov, Extremal probabilities for Gaussian quadratic forms, 2003).
+
+A part with far too small standard deviations determines the unknowns: its residuals and nu_g are nearly zero, and these
+bounds have little power. With v = R e, v'Pv is the sum of lambda_i chi-square_1, with the eigenvalues lambda_i of the
+block of R of the part and the sum nu_g. If lambda is the largest, no such sum has larger moments than lambda times
+chi-square with nu_g / lambda degrees of freedom (the moment generating function is convex in every lambda_i).
 """
 
 import equinox as eqx
@@ -18,6 +23,7 @@ from jaxphoto.camera import InteriorOrientation
 from jaxphoto.compiling import call_compiled
 from jaxphoto.short_repr import pretty_repr
 from jaxphoto.statistics.discrepancy import observation_groups
+from jaxphoto.statistics.hat_matrix import HatMatrix
 from jaxphoto.statistics.quantiles import chi_square_tails
 from jaxphoto.statistics.reliability import UNCHECKED, Redundancy
 from jaxphoto.statistics.variance_components import Parts
@@ -78,6 +84,27 @@ def part_factors(adjusted: Adjustment, parts: Parts, redundancy: Redundancy) -> 
         for label, n, square, r, expected in zip(parts.labels, *sums[:, :-1].tolist(), strict=True)
         if r > UNCHECKED
     ]
+
+
+def p_value_of_excess(adjusted: Adjustment, parts: Parts, factor: VarianceFactor) -> float:
+    """Return the one-sided p-value of a large variance `factor` of a part, with the largest eigenvalue of its R.
+
+    It needs a solution per observation of the part, which must contain no image points.
+    """
+    hat = HatMatrix.of(adjusted, image_rows=False)
+    k = parts.labels.index(factor.group)
+    at = np.concatenate([hat.places[name][part == k] for name, part in parts.part_of.items() if name != IMAGE_POINTS])
+    unit = np.eye(len(at))
+
+    def column(number: int) -> Float[np.ndarray, "n"]:
+        z = np.zeros(hat.count)
+        z[at] = unit[number]
+        return z
+
+    products, _ = hat.products(column, len(at))
+    largest = float(np.linalg.eigvalsh(unit - products)[-1])
+    square = factor.factor * factor.redundancy
+    return chi_square_tails(square / largest, factor.redundancy / largest)[1]
 
 
 def expected_residual_scale(adjusted: Adjustment) -> dict[str, float]:

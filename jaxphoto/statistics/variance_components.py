@@ -347,7 +347,10 @@ class VarianceComponents(eqx.Module):
     @property
     def words(self) -> str:
         """The factors of the standard deviations in words."""
-        factors = few([f"{label.replace('_', ' ')} {factor:.3g}" for label, factor in self.sigma_factors.items()])
+        # sigma of a factor of the variance is 2 sqrt(factor) times that of its root.
+        sigma = dict(zip(self.labels, (self.sigma / np.sqrt(self.factor) / 2).tolist(), strict=True))
+        pairs = self.sigma_factors.items()
+        factors = few([f"{label.replace('_', ' ')} {f:.3g} +- {sigma[label]:.2g}" for label, f in pairs])
         return f"standard deviations are estimated from the residuals, times the stated ones: {factors}"
 
 

@@ -174,6 +174,19 @@ def test_exposures_outside_the_trajectory_are_refused(fly):
         read_block(fly(times=np.array(TIMES) - 4 * DAY))
 
 
+@pytest.mark.parametrize("epoch", [START, 0.0], ids=["of the week", "from the first exposure"])
+@pytest.mark.parametrize("of", ["flight.csv", "images.csv"])
+def test_times_in_milliseconds_are_named(fly, of, epoch):
+    """Times from the first exposure lie within the trajectory in either unit, but between few of its records."""
+    records, times = flight(-START + epoch), np.array(TIMES) + epoch - START
+    if of == "flight.csv":
+        records = records._replace(time=1000 * records.time)
+    else:
+        times = 1000 * (times + START) - START
+    with pytest.raises(InputError, match=rf"{of}: .*milliseconds"):
+        read_block(fly(records, times))
+
+
 def holed():
     return flight(keep=lambda t: (t < 3.01) | (t > 4.02))
 

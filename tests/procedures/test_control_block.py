@@ -3,21 +3,23 @@
 import dataclasses
 import re
 
+import equinox as eqx
 import numpy as np
 import pytest
 
-from jaxphoto import adjust
+from jaxphoto import FIXED, adjust
+from jaxphoto.block import Datum
 from jaxphoto.errors import InputError
 from jaxphoto.georeferencing.map_frame import MapFrame
 from jaxphoto.observations import CameraPositions
 from jaxphoto.procedures.control import GivenControl, Marks, at_optimum, control_block
 from jaxphoto.procedures.control.control_block import check_handedness, check_units, onto_control
-from jaxphoto.procedures.control.marks import TURNED, intersected, turned_marks, without_names
+from jaxphoto.procedures.control.marks import TURNED, are_undistorted, intersected, turned_marks, without_names
 from jaxphoto.procedures.control.marks import marked as marked_rows
 from jaxphoto.rotation import matrix_from_omega_phi_kappa
 from jaxphoto.simulation import image_coordinates
-from tests.blocks import free_network, simulated
-from tests.procedures.controlled import CHECK, CODE, CONTROL, ORIGIN, marked_block
+from tests.blocks import calibration_flight, free_network, simulated
+from tests.procedures.controlled import CHECK, CODE, CONTROL, ORIGIN, marked_block, surveyed_and_without
 
 
 @pytest.fixture(scope="module")
@@ -133,6 +135,24 @@ def test_a_blunder_that_the_places_hide_is_found_by_the_adjustment(marked):
     assert len(check) == 3 * len(CHECK) and not np.asarray(check.sigma).any()
 
 
+@pytest.mark.parametrize("wrong", [("T1", "T2"), ("T2", "T3"), ("T5", "T7")])
+def test_two_wrong_heights_of_eight_are_named(wrong):
+    """25 m, which a tilt of the block brings within its tolerance for one of the two."""
+    block, truth, *_ = calibration_flight()
+    given, rest = surveyed_and_without(block)
+    empty = {name: rest.named_observations[name].take(np.zeros(0, int)) for name in ("stations", "attitudes")}
+    mount = lambda b: b.priors.mounts["default"].boresight  # noqa: E731
+    free = dataclasses.replace(eqx.tree_at(mount, rest.with_observations(empty), FIXED), datum=Datum("inner"))
+    xyz = given.points.coordinates.copy()
+    xyz[[given.points.ids.index(name) for name in wrong], 2] += 25.0
+    found = control_block(at_optimum(adjust(free)), with_coordinates(given, xyz))
+    assert {name for name, state in zip(found.ids, found.state, strict=True) if state == "left out"} == set(wrong)
+    off = dict(zip(found.ids, found.off_m, strict=True))
+    assert all(off[name][2] == pytest.approx(25.0, abs=0.5) for name in wrong)
+    c = found.adjusted.unknowns.interior["phase"].c
+    assert float(c) == pytest.approx(float(truth.interior["phase"].c), abs=0.1)
+
+
 def test_heights_that_nobody_surveyed_cost_a_sentence(marked):
     xyz = marked.control.points.coordinates.copy()
     xyz[:, 2] = 0.0
@@ -216,6 +236,20 @@ def test_marks_by_another_convention_are_named_by_the_one_that_restores_them(mar
     np.testing.assert_allclose(restored, control.marks.column_row[inside], atol=1e-6)
     true, _ = marked_rows(marked.block, control.points, control.marks)
     assert turned_marks(marked.block, start, true, np.ones(len(true.image), bool)) is None
+
+
+def test_marks_of_undistorted_pictures_are_refused(marked):
+    control, sensor = marked.control, marked.block.sensors["one"]
+    interior = marked.block.start.unknowns.interior["one"]
+    xy = sensor.mm_from_px(control.marks.column_row)
+    ideal = np.array([interior.ideal_from_measured(p) for p in xy]) + np.asarray(interior.principal_point)
+    undistorted = control.marks._replace(column_row=sensor.px_from_mm(ideal))
+    start = marked.block.start.unknowns
+    for marks, expected in ((control.marks, False), (undistorted, True)):
+        rows, _ = marked_rows(marked.block, control.points, marks)
+        assert are_undistorted(marked.block, start, rows) is expected
+    with pytest.raises(InputError, match="undistorted"):
+        found_in(marked, control._replace(marks=undistorted))
 
 
 @pytest.mark.parametrize("axis", [0, 2])

@@ -7,10 +7,10 @@ import numpy as np
 import pytest
 
 from benchmarks.weights import coverage, flights
-from jaxphoto import adjust, covariance, estimate_weights, halves, variance_components
+from jaxphoto import Tables, adjust, covariance, estimate_weights, halves, variance_components
 from jaxphoto.procedures.model_choice import model_choice
 from jaxphoto.procedures.snooping import inflated_components
-from jaxphoto.report import component_findings
+from jaxphoto.report import component_findings, verdict_of
 from jaxphoto.simulation import remeasure
 from jaxphoto.stability import image_grid
 from tests.blocks import adjusted_example, calibration_flight, example, free_network
@@ -104,6 +104,35 @@ def test_a_common_shift_is_no_wrong_sigma():
     estimated = estimate_weights(adjust(noisy))
     plan = dict(zip(estimated.labels, np.sqrt(estimated.factor), strict=True))["control_points X-Y"]
     assert plan == pytest.approx(25.0, rel=0.5)
+
+
+@pytest.mark.parametrize("case", ["attitudes in radians", "attitude variances", "station variances", "GNSS of 0.1 m"])
+def test_sigmas_of_a_whole_group_that_are_far_too_small_accuse_no_observation(case):
+    """Radians under a name in degrees, or variances: the group has no redundancy, and others have its residuals."""
+    block, *_ = calibration_flight()
+    attitudes, stations = block.attitudes, block.stations
+    if case.startswith("attitude"):
+        degrees = np.rad2deg(np.asarray(attitudes.sigma))
+        stated = np.deg2rad(degrees) if "radians" in case else degrees**2
+        block = block.with_observations({"attitudes": dataclasses.replace(attitudes, sigma=np.deg2rad(stated))})
+        true = {"attitudes": np.median(degrees / stated)}
+    else:
+        sigma, value = np.asarray(stations.sigma), np.asarray(stations.value)
+        if "0.1" in case:
+            rng = np.random.default_rng(6)
+            value = value + np.sqrt(0.01 - sigma**2) * rng.normal(size=len(sigma))
+            sigma = np.full(len(sigma), 0.1)
+        block = block.with_observations({"stations": dataclasses.replace(stations, value=value, sigma=sigma**2)})
+        true = {f"stations {part}": 1 / sigma[stations.axis == axis][0] for part, axis in (("X-Y", 0), ("Z", 2))}
+    stated = Tables(adjust(block))
+    estimated = estimate_weights(stated.adjusted)
+    assert estimated.converged and set(estimated.labels) <= set(true)
+    for label, factor, sigma in zip(estimated.labels, estimated.factor, estimated.sigma, strict=True):
+        # In logarithms: few degrees of freedom.
+        assert abs(np.log(factor / true[label] ** 2)) < 3 * sigma / factor
+    tables = Tables(estimated.adjusted)
+    findings = verdict_of(tables, component_findings(estimated, [], (stated, tables))).findings
+    assert {f.code for f in findings if f.severity != "note"} <= {"weights", "small_sigma"}
 
 
 def test_image_points_that_fit_nothing_keep_their_weight(block):

@@ -140,6 +140,19 @@ def test_another_north_is_named_although_the_boresight_absorbs_most_of_it():
     assert first_cause(tables) == test.pattern.what
 
 
+def test_another_height_reference_of_a_second_flight_is_named_before_a_camera_that_changes():
+    """The p-values of both underflow."""
+    block, *_ = calibration_flight()
+    rows = block.stations
+    second = np.char.startswith(block.image_strip, "N")[rows.who] & (rows.axis == 2)
+    value = np.asarray(rows.value) + 15.0 * second
+    tables = Tables(adjust(block.with_observations({"stations": dataclasses.replace(rows, value=value)})))
+    assert first_cause(tables) == "stations from strip to strip"
+    cause = next(f for f in verdict_of(tables).findings if f.code == "systematic")
+    strip, size, sigma = re.search(r"Z of strip (N\d) \+([\d.]+) \+- ([\d.]+) m", cause.text).groups()
+    assert strip in block.image_strip and abs(float(size) - 15.0) < 3 * float(sigma) < 0.3
+
+
 def first_cause(tables) -> str:
     """Subject of the first finding that names a cause of large residuals."""
     first = next(f for f in verdict_of(tables).findings if f.code in ("systematic", "blunder"))

@@ -167,6 +167,7 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
     if not len(image):
         raise images.table.misfit(0, f"no image has a time_s, but {records.file} needs it; add it")
     times = times[image]
+    _check_unit(records, times, images.table.file)
     max_gap = keys.max_gap_s if keys is not None and keys.max_gap_s else _GAP * float(np.median(np.diff(records.time)))
     near = _near(records, times)
     sigmas = []
@@ -203,6 +204,25 @@ def _interpolated(records: Records, images: Images, frame: Frame, settings: Sett
     attitudes = Attitudes(image, _angles(poses.object_from_body), jnp.asarray(poses.sigma_attitude))
     known = np.isin(np.arange(len(images.ids)), image)
     return ObservedFlight(stations, attitudes, Motion(jnp.asarray(velocity), jnp.asarray(rate)), known, known)
+
+
+def _check_unit(records: Records, times: np.ndarray, file: str) -> None:
+    """Raise InputError if the times of one file are in milliseconds: in seconds the records cover all exposures.
+
+    Records that cover them without conversion must be further apart than the exposures, to no use of a trajectory.
+    """
+    apart, between = (float(np.median(np.diff(np.sort(t)))) if len(t) > 1 else 0.0 for t in (records.time, times))
+    if ((times >= records.time[0]) & (times <= records.time[-1])).all() and apart <= between:
+        return
+    for name, start, end, exposures in (
+        (records.file, *records.time[[0, -1]] / 1000, times),
+        (file, *records.time[[0, -1]], times / 1000),
+    ):
+        if (exposures >= start).all() and (exposures <= end).all():
+            raise InputError(
+                f"{name}: its times are in milliseconds: divided by 1000, the trajectory covers all exposures; "
+                "write time_s in seconds"
+            )
 
 
 def _near(records: Records, times: np.ndarray) -> Records:

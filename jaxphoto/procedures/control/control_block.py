@@ -11,7 +11,8 @@ Normalised residuals test observations (Baarda). Check points and rejected point
 by its standard deviation, which includes survey and adjustment.
 
 Every three points (or 300 samples of three) determine a similarity. The one with the most consistent points is refined
-by least squares of these. The tolerance allows for deformations that the adjustment removes: distortion, or weakly
+by least squares of these, unless more than half of all points fit another one ten times better (least trimmed squares,
+Rousseeuw 1984). The tolerance allows for deformations that the adjustment removes: distortion, or weakly
 determined positions. The first adjustment, which tests all points, starts without inconsistent ones.
 """
 
@@ -30,6 +31,7 @@ from jaxphoto.georeferencing.map_frame import MapFrame, check_area, check_height
 from jaxphoto.procedures.adjust import adjust_for_tables
 from jaxphoto.procedures.control.marks import (
     Marked,
+    are_undistorted,
     factor_of_marks,
     intersected,
     into_block,
@@ -168,23 +170,49 @@ def _of_threes(there, here) -> Iterator[Similarity]:
 
 
 def _best(there, here, sigma_m) -> OntoControl | None:
-    tolerance = _tolerance(here, sigma_m)
-    best: tuple[float, Similarity] | None = None
-    for similarity in _of_threes(there, here):
-        off = _off(similarity, there, here) / tolerance
-        score = float(np.sum(off < 1) - np.minimum(off, 1).mean())
-        if best is None or score > best[0]:
-            best = score, similarity
-    if best is None:
+    samples = list(_of_threes(there, here))
+    if not samples:
         return None
-    similarity = best[1]
+    tolerance = _tolerance(here, sigma_m)
+
+    def score(similarity: Similarity) -> float:
+        off = _off(similarity, there, here) / tolerance
+        return float(np.sum(off < 1) - np.minimum(off, 1).mean())
+
+    similarity = max(samples, key=score)
     for _ in range(5):
         agree = _off(similarity, there, here) < tolerance
         refined = similarity_between(there[agree], here[agree])
         if refined is None:
             break
         similarity = refined
-    return OntoControl(similarity, _off(similarity, there, here) < tolerance)
+    off = _off(similarity, there, here)
+    agree = off < tolerance
+    # A tilt may bring wrong heights within the tolerance: without them, more than half of the points fit far better.
+    most = len(here) // 2 + 2
+    if most < len(here) and agree.any():
+        trimmed = _trimmed(samples, there, here, most)
+        rest = _off(trimmed, there, here)
+        scatter = np.sqrt(np.mean(np.sort(rest)[:most] ** 2))
+        if scatter < _FITS_BETTER * np.sqrt(np.mean(off[agree] ** 2)):
+            return OntoControl(trimmed, rest < np.minimum(tolerance, _BEYOND * np.hypot(sigma_m, scatter)))
+    return OntoControl(similarity, agree)
+
+
+def _trimmed(samples: list[Similarity], there, here, most: int) -> Similarity:
+    """Return the similarity with the least sum of the `most` smallest squares (least trimmed squares, C-steps)."""
+
+    def square(similarity: Similarity) -> float:
+        return float(np.sum(np.sort(_off(similarity, there, here))[:most] ** 2))
+
+    best = min(samples, key=square)
+    for _ in range(5):
+        chosen = np.argsort(_off(best, there, here))[:most]
+        refined = similarity_between(there[chosen], here[chosen])
+        if refined is None or square(refined) >= square(best):
+            break
+        best = refined
+    return best
 
 
 class InFrame(NamedTuple):
@@ -415,6 +443,11 @@ def control_block(
             f"{factor:.3g}: they were measured in pictures of about {sensor.width_px / factor:.0f} x "
             f"{sensor.height_px / factor:.0f} px, the camera has {sensor.width_px} x {sensor.height_px} px. Multiply "
             "them, or mark the photographs in full size"
+        )
+    if are_undistorted(block, block.start.unknowns, rows):
+        raise InputError(
+            f"{points.file}: the rays of the marks intersect far better without the distortion of the camera, as if "
+            "measured in undistorted pictures: measure them in the original pictures"
         )
     rows, messages = rows.take(met.good), [*messages, *met.sentences]
     sigma = np.where(np.isnan(points.sigma_m), SIGMA_M, points.sigma_m)

@@ -18,6 +18,7 @@ from jaxtyping import Bool, Float, Int
 from jaxphoto.arrays import as_jax_array
 from jaxphoto.block import Block
 from jaxphoto.block_parts import Datum, Start
+from jaxphoto.camera import InteriorOrientation
 from jaxphoto.errors import counted, few
 from jaxphoto.georeferencing import FlightBias
 from jaxphoto.initial.intersection import intersect_points, intersect_with_covariance
@@ -173,6 +174,10 @@ def intersected(block: Block, unknowns: Unknowns, rows: Marked, ids: tuple[str, 
 _FACTORS, _AGREE, _DISAGREE = np.geomspace(0.1, 10.0, 461), 0.9, 0.5
 
 
+# Minimum number of marks, and minimum ratio of their misclosures with and without distortion, of undistorted pictures.
+_UNDISTORTED_MARKS, _UNDISTORTED = 8, 3.0
+
+
 TURNED: dict[str, Callable[[np.ndarray, np.ndarray], np.ndarray]] = {
     "columns and rows are exchanged": lambda p, size: p[:, ::-1],
     "rows count from the bottom": lambda p, size: np.stack([p[:, 0], size[:, 1] - p[:, 1]], axis=1),
@@ -209,25 +214,38 @@ def factor_of_marks(block: Block, unknowns: Unknowns, rows: Marked, good: Bool[n
     contradicting = _Contradicting.of(block, unknowns, rows, good)
     if contradicting is None:
         return None
-    point, n = contradicting.rows.point, int(contradicting.rows.point.max()) + 1
-    origins = np.asarray(unknowns.exterior.position, float)[contradicting.rows.image]
-    matrices = np.asarray(unknowns.exterior.camera_from_object, float)
 
     def scaled(factor: float) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
         return lambda column_row, size: factor * column_row
 
     def misclosure(factor: float) -> float:
-        rows = contradicting.converted(scaled(factor))
-        directions = turn_to_object(matrices, rows.image, rays_of(block, unknowns, rows))
-        places, _ = intersect_points(origins, directions, point, n, min_angle=_PARALLEL)
-        towards = places[point] - origins
-        across = np.linalg.norm(np.cross(directions, towards), axis=1) / np.linalg.norm(towards, axis=1)
-        return float(np.nanmedian(across))
+        return _median_misclosure(block, unknowns, contradicting.converted(scaled(factor)))
 
     factor = float(min(_FACTORS, key=misclosure))
     step = _FACTORS[1] / _FACTORS[0]
     factor = float(min(np.geomspace(factor / step, factor * step, 41), key=misclosure))
     return factor if contradicting.agreement(scaled(factor)) >= _AGREE else None
+
+
+def are_undistorted(block: Block, unknowns: Unknowns, rows: Marked) -> bool:
+    """Return True if rays of the marks intersect far better without distortion, as in undistorted pictures."""
+    rows = rows.take(np.bincount(rows.point)[rows.point] > 1)
+    if len(rows.image) < _UNDISTORTED_MARKS:
+        return False
+    ideal = {name: InteriorOrientation(i.c, i.xp, i.yp) for name, i in unknowns.interior.items()}
+    without = dataclasses.replace(unknowns, interior=ideal)
+    return _UNDISTORTED * _median_misclosure(block, without, rows) < _median_misclosure(block, unknowns, rows)
+
+
+def _median_misclosure(block: Block, unknowns: Unknowns, rows: Marked) -> float:
+    """Return the median angle (rad) between rays of marks and the directions to their intersections."""
+    origins = np.asarray(unknowns.exterior.position, float)[rows.image]
+    matrices = np.asarray(unknowns.exterior.camera_from_object, float)
+    directions = turn_to_object(matrices, rows.image, rays_of(block, unknowns, rows))
+    places, _ = intersect_points(origins, directions, rows.point, int(rows.point.max()) + 1, min_angle=_PARALLEL)
+    towards = places[rows.point] - origins
+    across = np.linalg.norm(np.cross(directions, towards), axis=1) / np.linalg.norm(towards, axis=1)
+    return float(np.nanmedian(across))
 
 
 class _Contradicting(NamedTuple):
