@@ -25,7 +25,7 @@ _NUMBER = r"([+-][\d.e+-]+) \+- ([\d.e+-]+)"
 
 
 def disturbed(block: Block, kind: str, rng: np.random.Generator) -> tuple[Block, str, float]:
-    """Return the block with one error, the words of its subject in a finding, and its size (m, mm)."""
+    """Return the block with one error, the pattern of its size in a finding, and its size (m, mm)."""
     size = 10 ** rng.uniform(0, 3) * rng.choice([-1.0, 1.0])
     if kind == "image point":
         rows, row, axis = block.image_points, rng.integers(len(block.image_points)), rng.integers(2)
@@ -33,7 +33,8 @@ def disturbed(block: Block, kind: str, rng: np.random.Generator) -> tuple[Block,
         xy = np.array(rows.xy)
         xy[row, axis] += size
         label = rows.words_of(np.array([axis]), np.array([row]), block.images, block.points)[0]
-        return block.with_observations({"image_points": eqx.tree_at(lambda r: r.xy, rows, xy)}), f"{label}: error", size
+        pattern = f"{re.escape(label)}: error {_NUMBER} mm in {'xy'[axis]}"
+        return block.with_observations({"image_points": eqx.tree_at(lambda r: r.xy, rows, xy)}), pattern, size
     name = "control_points" if "control" in kind else "stations"
     rows = block.named_observations[name]
     axis = rng.integers(3)
@@ -53,13 +54,14 @@ def disturbed(block: Block, kind: str, rng: np.random.Generator) -> tuple[Block,
     if kind == "all control points":
         # Findings name the opposite shift of the stations.
         size = -size
-    return block.with_observations({name: eqx.tree_at(lambda r: r.value, rows, value)}), label, size
+    pattern = f"{re.escape(label)} {_NUMBER}"
+    return block.with_observations({name: eqx.tree_at(lambda r: r.value, rows, value)}), pattern, size
 
 
-def stated(block: Block, start: Unknowns, label: str) -> tuple[float, float] | None:
+def stated(block: Block, start: Unknowns, pattern: str) -> tuple[float, float] | None:
     """Return size and sigma of the error in the findings, if they name it."""
     for finding in verdict_of(Tables(adjust(block, start))).findings:
-        if finding.code in ("blunder", "systematic") and (found := re.search(f"{label} {_NUMBER}", finding.text)):
+        if finding.code in ("blunder", "systematic") and (found := re.search(pattern, finding.text)):
             return float(found[1]), float(found[2])
     return None
 
@@ -77,9 +79,9 @@ def main() -> None:
         began, ratios = time.perf_counter(), list[float]()
         for seed in range(arguments.flights):
             new = eqx.tree_at(observed, block, jax.tree.map(np.asarray, drawn(jax.random.key(seed))))
-            wrong, label, size = disturbed(new, kind, np.random.default_rng(seed))
+            wrong, pattern, size = disturbed(new, kind, np.random.default_rng(seed))
             try:
-                found = stated(wrong, truth, re.escape(label))
+                found = stated(wrong, truth, pattern)
             except ValueError as error:
                 print(f"{kind}, seed {seed}: {error}")
                 continue

@@ -197,6 +197,8 @@ def _blunders(
     for severe, s, name, moved in sorted(judged, key=lambda j: not j[0])[:_SHOWN]:
         factor, unit = in_file_unit(s.unit)
         error, sigma = sizes.suspects[s.group, s.row, s.number] if sizes else (s.error, s.sigma)
+        # Labels of image points contain no coordinate.
+        unit += f" in {'xy'[s.number]}" if s.group == IMAGE_POINTS else ""
         size = f"{_signed(factor * error, factor * sigma)} {unit} if it alone is wrong"
         if sizes:
             others = len(sizes.suspects) + len(sizes.terms) - 1
