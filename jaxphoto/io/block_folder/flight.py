@@ -211,7 +211,9 @@ def _check_unit(records: Records, times: np.ndarray, file: str) -> None:
 
     Records that cover them without conversion must be further apart than the exposures, to no use of a trajectory.
     """
-    apart, between = (float(np.median(np.diff(np.sort(t)))) if len(t) > 1 else 0.0 for t in (records.time, times))
+    # The cameras of a rig expose at the same time.
+    steps = (np.diff(np.unique(t)) for t in (records.time, times))
+    apart, between = (float(np.median(step)) if len(step) else np.inf for step in steps)
     if ((times >= records.time[0]) & (times <= records.time[-1])).all() and apart <= between:
         return
     for name, start, end, exposures in (
