@@ -31,7 +31,7 @@ from jaxphoto.experiment import MonteCarlo
 from jaxphoto.experiment.simulated_flights import simulate_flights
 from jaxphoto.io.recipe import read_recipe
 from jaxphoto.sensitivity import Readjustment, bias
-from jaxphoto.workers import connected
+from jaxphoto.workers import connected, in_parts
 
 HERE = Path(__file__).resolve()
 ROOT = HERE.parents[1]
@@ -49,7 +49,7 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=3)
     parser.add_argument("--kills", type=int, default=10)
     parser.add_argument("--every-s", type=float, default=20.0)
-    parser.add_argument("--fault-draws", type=int, default=600_000)
+    parser.add_argument("--fault-draws", type=int, default=800_000)
     parser.add_argument("--out", type=Path)
     parser.add_argument("--study", choices=STUDIES, help=argparse.SUPPRESS)
     parser.add_argument("--workers", type=int, help=argparse.SUPPRESS)
@@ -79,6 +79,12 @@ def _state() -> tuple[float, float]:
     return _cpu(), memory("VmHWM")
 
 
+def _one_core() -> None:
+    """Restrict all threads of this process to its first core; JAX is not yet started."""
+    for thread in os.listdir("/proc/self/task"):
+        os.sched_setaffinity(int(thread), {min(os.sched_getaffinity(0))})
+
+
 def _monte_carlo(size: str, draws: int):
     """Return a function of folder, seed and number of draws that makes a study."""
     block = block_of(generate(SIZES[size]), "draws")
@@ -93,6 +99,9 @@ def _measured(study: str, workers: int) -> dict:
     recipe = read_recipe(ROOT / "experiments" / "000" / "recipe.toml") if study == "flights" else None
     made = None if recipe else _monte_carlo(study, count)
     with tempfile.TemporaryDirectory() as name, connected(workers or None, None) as client:
+        if workers == 1:
+            # A single worker has all cores.
+            client.run(_one_core)
 
         def run(n: int, seed: int) -> None:
             folder = Path(name) / str(seed)
@@ -101,18 +110,52 @@ def _measured(study: str, workers: int) -> dict:
             else:
                 made(folder, seed, n).draw(client=client)
 
-        run(8 * max(workers, 1) if recipe else min(count, 8000), 10**6)
+        def timed(n: int, seed: int) -> tuple[float, float]:
+            """Return wall time and processor time of this process."""
+            cpu, began = _cpu(), time.perf_counter()
+            run(n, seed)
+            return time.perf_counter() - began, _cpu() - cpu
+
+        first = 8 * max(workers, 1) if recipe else count // 10
+        run(first, 10**6)
+        few = timed(first, 10**6 + 1) if client else (0.0, 0.0)
+        idle = _idle() if client else 0.0
         before = client.run(_state) if client else {}
-        cpu, began = _cpu(), time.perf_counter()
-        run(count, 0)
-        wall, spent = time.perf_counter() - began, _cpu() - cpu
+        wall, spent = timed(count, 0)
         after = client.run(_state) if client else {"here": _state()}
-        size = sum(file.stat().st_size for file in (Path(name) / "0").rglob("draws.parquet"))
+        part = json.loads((Path(name) / "0" / "run.json").read_text())["per_part"]
+        size = sum(file.stat().st_size for file in (Path(name) / "0").rglob("*.parquet"))
+        # Without what passes while workers compute, and without what a run of any length costs.
+        per_draw = (spent - few[1] - idle * (wall - few[0])) / (count - first)
+        scheduling = _scheduling(client) if client else 0.0
     of_workers = sum(after[at][0] - before[at][0] for at in before)
     return {
         "study": study, "workers": workers, "per_s": count / wall, "wall_s": wall, "client_cpu_s": spent,
         "workers_cpu_s": of_workers, "memory_mb": max(state[1] for state in after.values()), "bytes": size,
+        "draws_per_part": part, "idle": idle, "client_s_per_draw": max(per_draw, 0.0), "s_per_part": scheduling,
     }  # fmt: skip
+
+
+def _idle(seconds: float = 10.0) -> float:
+    """Return the fraction of a core that client, scheduler and nannies take while they wait."""
+    began = _cpu()
+    time.sleep(seconds)
+    return (_cpu() - began) / seconds
+
+
+class _Empty:
+    """Study whose parts cost nothing."""
+
+    def compute(self, part: int) -> int:
+        """Return the part."""
+        return part
+
+
+def _scheduling(client, parts: int = 1000) -> float:
+    """Return the seconds that client and scheduler take per part."""
+    began = _cpu()
+    assert sorted(k for k, _ in in_parts(_Empty(), ((k, k) for k in range(parts)), client)) == list(range(parts))
+    return (_cpu() - began) / parts
 
 
 def _command(study: str, workers: int) -> list[str]:
@@ -155,32 +198,33 @@ def _rate_table(records: list[dict]) -> list[str]:
     head = ["study", "run", "per second", "to one", "client CPU [s]", "workers' CPU [s]", "memory per process [MB]"]
     rows = []
     for study in dict.fromkeys(r["study"] for r in records):
-        one = _of(records, study, "one process", "per_s"), _of(records, study, "1 worker", "per_s")
         for kind in ("one process", "two processes", "1 worker", "2 workers"):
             fields = ("per_s", "client_cpu_s", "workers_cpu_s", "memory_mb")
             rate, client, workers, mb = (_of(records, study, kind, field) for field in fields)
-            base = one[0] if "process" in kind or kind == "1 worker" else one[1]
+            one = _of(records, study, "1 worker" if kind == "2 workers" else "one process", "per_s")
             rows.append(
-                [study, kind, f"{rate:.4g}", f"{rate / base:.3f}", f"{client:.2f}", f"{workers:.2f}", f"{mb:.0f}"]
+                [study, kind, f"{rate:.4g}", f"{rate / one:.3f}", f"{client:.2f}", f"{workers:.2f}", f"{mb:.0f}"]
             )
     return markdown(head, rows)
 
 
 def _model(records: list[dict]) -> list[str]:
-    """The client handles results one after the other; workers compute at the same time."""
+    """The client handles parts one after the other; workers compute at the same time."""
     rows = []
     for study in dict.fromkeys(r["study"] for r in records):
-        client, workers = (_of(records, study, "1 worker", f) for f in ("client_cpu_s", "workers_cpu_s"))
-        seconds, n = _of(records, study, "1 worker", "bytes") / _NETWORK, STUDIES[study]
-        limit = workers / max(client, seconds)
-        at_1000 = min(1000.0, limit) / workers * n
+        of = {f: _of(records, study, "1 worker", f) for f in records[0] if f != "kind" and f != "study"}
+        n, idle, size = STUDIES[study], of["idle"], of["draws_per_part"]
+        worker, client = of["workers_cpu_s"] / n, of["client_s_per_draw"]
+        network, scheduling = of["bytes"] / n / _NETWORK, of["s_per_part"] / size
+        most = 1 / max((client + scheduling) / max(1 - idle, 0.1), network)
         rows.append(
-            [study, f"{1e3 * workers / n:.3g}", f"{1e3 * client / n:.3g}", f"{1e3 * seconds / n:.3g}", f"{limit:.0f}",
-             f"{at_1000:,.0f}"]
+            [study, f"{1e3 * worker:.3g}", f"{size:.0f}", f"{1e3 * of['s_per_part']:.2g}",
+             f"{1e3 * (client + scheduling):.2g}", f"{1e3 * network:.2g}", f"{worker * most:,.0f}",
+             f"{min(1000 / worker, most):,.0f}"]
         )  # fmt: skip
     head = [
-        "study", "worker [ms per draw]", "client [ms per draw]", "network [ms per draw]", "workers at the limit",
-        "draws per second with 1000 workers",
+        "study", "worker [ms per draw]", "draws per part", "scheduling [ms per part]", "client [ms per draw]",
+        "network [ms per draw]", "workers at the limit", "draws per second with 1000 workers",
     ]  # fmt: skip
     return markdown(head, rows)
 

@@ -5,6 +5,7 @@ which passes it on; each worker keeps it, with what it compiled. Results return 
 so the machines need no common file system. Results do not depend on the number of workers or their order.
 """
 
+import hashlib
 import io
 import logging
 import os
@@ -16,7 +17,6 @@ from itertools import islice
 from threading import Lock
 from typing import TYPE_CHECKING, Any, Protocol
 from urllib.parse import urlsplit
-from uuid import uuid4
 
 import jax
 
@@ -28,8 +28,12 @@ if TYPE_CHECKING:
 
 # Number of parts per worker or thread that are computed or wait for it: none of them waits for the next part.
 _AHEAD = 2
-# Number of workers of a local cluster that may die while they compute a part: more, and the part is too large.
-_DEATHS = 10
+# Of a local cluster: number of workers that may die while they compute a part (more, and the part is too large);
+# processes that wake up 50 times per second, and a profiler that nobody reads, would take 7 % of a core with two workers.
+_LOCAL = {
+    "distributed.scheduler.allowed-failures": 10, "distributed.worker.memory.terminate": False,
+    "distributed.admin.tick.interval": "1s", "distributed.worker.profile.enabled": False,
+}  # fmt: skip
 # Runs in each worker before it imports JAX: divide the cores among the workers of this machine.
 _PIN = """
 import os
@@ -66,10 +70,12 @@ def in_parts(
         import dask
         from distributed import KilledWorker, as_completed
         from distributed.comm import CommClosedError
-    waiting, name, numbers = iter(parts), uuid4().hex, dict[Any, int]()
+    waiting, pickled, numbers = iter(parts), _pickled(study), dict[Any, int]()
+    # Workers keep what they compiled for the next call with the same study.
+    name = hashlib.sha256(pickled).hexdigest()
     # As the result of a task, unlike scattered data, the study survives the death of the worker that holds it.
     with dask.config.set({"distributed.admin.large-graph-warning-threshold": "1TB"}):
-        sent = client.submit(bytes, _pickled(study), key=f"study-{name}", pure=False)
+        sent = client.submit(bytes, pickled, key=f"study-{name}")
 
     def submit() -> list[Any]:
         """Submit parts up to the number that the present workers need."""
@@ -186,14 +192,20 @@ def connected(workers: int | None, scheduler: str | None) -> Iterator["Client | 
             raise InputError(
                 f"no Dask scheduler answers at {scheduler} ({error}): start it, or correct the address"
             ) from None
-        with client:
-            yield client
+        # `in_parts` reports a lost scheduler.
+        log = logging.getLogger("distributed.client")
+        level = log.level
+        log.setLevel(logging.CRITICAL)
+        try:
+            with client:
+                yield client
+        finally:
+            log.setLevel(level)
         return
     count = workers or 1
-    deaths = {"distributed.scheduler.allowed-failures": _DEATHS, "distributed.worker.memory.terminate": False}
     environment = _ENVIRONMENT | {"JAX_PLATFORMS": os.environ.get("JAX_PLATFORMS", "cpu")}
     with (
-        dask.config.set(deaths),
+        dask.config.set(_LOCAL),
         LocalCluster(
             n_workers=count, threads_per_worker=1, host="127.0.0.1", dashboard_address="127.0.0.1:0", memory_limit=0,
             silence_logs=logging.ERROR, preload=[_PIN.format(workers=count)], env=environment,

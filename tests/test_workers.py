@@ -31,6 +31,17 @@ class Failing(Squares):
         return part
 
 
+class Kept(Squares):
+    """A study that counts the parts that an instance computes."""
+
+    def __init__(self):
+        self.parts = 0
+
+    def compute(self, part):
+        self.parts += 1
+        return self.parts
+
+
 @pytest.fixture(scope="module")
 def client():
     with connected(2, None) as connection:
@@ -62,6 +73,12 @@ def test_every_part_is_computed_once_although_workers_die(client):
     assert found.keys() == here.keys()
     for number, result in here.items():
         np.testing.assert_array_equal(found[number], result)
+
+
+def test_workers_keep_a_study_for_the_next_call():
+    with connected(1, None) as own:
+        counts = [n for _ in range(2) for _, n in in_parts(Kept(), [(k, k) for k in range(4)], own)]
+    assert sorted(counts) == list(range(1, 9))
 
 
 def test_errors_of_the_study_and_lost_schedulers_are_told_apart(client):
