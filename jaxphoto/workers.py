@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 # Number of parts per worker or thread that are computed or wait for it: none of them waits for the next part.
 _AHEAD = 2
 # Of a local cluster: number of workers that may die while they compute a part (more, and the part is too large);
-# processes that wake up 50 times per second, and a profiler that nobody reads, would take 7 % of a core with two workers.
+# processes that wake up 50 times per second and a profiler nobody reads would take 7 % of a core with two workers.
 _LOCAL = {
     "distributed.scheduler.allowed-failures": 10, "distributed.worker.memory.terminate": False,
     "distributed.admin.tick.interval": "1s", "distributed.worker.profile.enabled": False,
